@@ -60,9 +60,8 @@ tools.guard
 """
 # laws whose libraries take arrays: they import numpy with them, at first use
 EXTRAS = ("agents.plugins.extras.mpc", "agents.plugins.extras.policy")
-DEVICES = (
-    "crazyflie examples external khepera4 motion_capture tello turtlebot3"  # in one line of ORDER: none imports another
-)
+# a line of ORDER, in which none imports another
+DEVICES = "crazyflie examples external khepera4 motion_capture tello turtlebot3"
 FLOORS = [
     [f"bridges.{name}" for name in DEVICES.split()] if line == "DEVICES" else line.split()
     for line in ORDER.strip().splitlines()

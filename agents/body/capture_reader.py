@@ -28,7 +28,7 @@ class MeasuredPose(NamedTuple):
 
 @dataclass(frozen=True)
 class CaptureFrame:
-    """One frame of motion capture."""
+    """Frame of motion capture: the poses of all bodies at one instant."""
 
     number: int  # number of the server
     poses: Mapping[str, MeasuredPose | None]  # pose of each body; None while it is not tracked
@@ -82,6 +82,14 @@ def readable(sockets: Sequence[socket.socket], deadline: float) -> bool:
     for each in sockets:
         waiting.register(each, select.POLLIN)
     return bool(waiting.poll(1000.0 * max(0.0, deadline - time.monotonic())))
+
+
+def connect_tcp(host: str, port: int, timeout_s: float) -> socket.socket:
+    """Connection over TCP that never blocks and delays no packet; raises OSError if there is none in time [s]."""
+    connection = socket.create_connection((host, port), timeout_s)
+    connection.setblocking(False)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    return connection
 
 
 def received(connection: socket.socket) -> bytes:

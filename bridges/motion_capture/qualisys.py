@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import math
-import socket
 import time
 from collections import deque
 from typing import ClassVar, Final
 
 from agents.body.byte_stream import MalformedStream
-from agents.body.capture_reader import CaptureFrame, CaptureReader, MeasuredPose, by_name, readable, received
+from agents.body.capture_reader import (
+    CaptureFrame,
+    CaptureReader,
+    MeasuredPose,
+    by_name,
+    connect_tcp,
+    readable,
+    received,
+)
 from bridges.motion_capture.protocol import qtm
 from bridges.motion_capture.protocol.qtm import PacketFramer, QtmFrame, QtmPacketKind
 
@@ -28,10 +35,8 @@ class QualisysReader(CaptureReader):
         deadline = time.monotonic() + timeout_s
         self._framer = PacketFramer()
         self._waiting: deque[tuple[int, bytes]] = deque()  # packets received, not decoded yet
-        self._socket = socket.create_connection((host, port), timeout_s)
-        self._socket.setblocking(False)
+        self._socket = connect_tcp(host, port, timeout_s)
         try:
-            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             if not self._answer(QtmPacketKind.COMMAND, deadline).startswith(qtm.WELCOME):
                 raise MalformedStream("another server than QTM's")
             self._socket.sendall(qtm.command(f"Version {qtm.VERSION}".encode()))

@@ -6,13 +6,20 @@ The vendor's own client blocks the interpreter while it connects, and never retu
 from __future__ import annotations
 
 import math
-import socket
 import time
 from collections import deque
 from typing import ClassVar
 
 from agents.body.byte_stream import MalformedStream
-from agents.body.capture_reader import CaptureFrame, CaptureReader, MeasuredPose, by_name, readable, received
+from agents.body.capture_reader import (
+    CaptureFrame,
+    CaptureReader,
+    MeasuredPose,
+    by_name,
+    connect_tcp,
+    readable,
+    received,
+)
 from bridges.motion_capture.protocol import vicon_datastream
 from bridges.motion_capture.protocol.vicon_datastream import BlockKind, Framer, Segment, Subject
 
@@ -72,10 +79,8 @@ class ViconReader(CaptureReader):
         deadline = time.monotonic() + timeout_s
         self._framer, self._decoder = Framer(), Decoder()
         self._waiting: deque[bytes] = deque()  # packets received, not decoded yet
-        self._socket = socket.create_connection((host, port), timeout_s)
-        self._socket.setblocking(False)
+        self._socket = connect_tcp(host, port, timeout_s)
         try:
-            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             offered = self._offered_streams(deadline)
             if BlockKind.GLOBAL_SEGMENTS not in offered:
                 raise MalformedStream("the server has no segments to offer")

@@ -1,4 +1,4 @@
-"""What docs show: pictures of the gallery, drawn by a program that runs, and layouts of Foxglove and RViz."""
+"""Pictures of the gallery, drawn by a program that runs, and layouts of Foxglove and RViz that docs name."""
 
 import json
 import runpy

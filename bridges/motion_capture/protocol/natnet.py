@@ -62,7 +62,7 @@ class RigidBodyPose(NamedTuple):
 
 @dataclass(frozen=True)
 class NatNetFrame:
-    """One frame of Motive."""
+    """Frame of Motive."""
 
     number: int
     bodies: Sequence[RigidBodyPose]

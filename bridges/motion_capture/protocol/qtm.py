@@ -45,7 +45,7 @@ class BodyPose(NamedTuple):
 
 
 class QtmFrame(NamedTuple):
-    """One frame of QTM."""
+    """Frame of QTM."""
 
     time_s: float  # clock of the server [s]
     number: int

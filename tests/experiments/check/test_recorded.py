@@ -38,7 +38,7 @@ def test_file_goes_with_the_experiment(file, tmp_path):
     kept.mkdir()
     read.keep(kept / "experiment.toml")
     assert (kept / "path.csv").read_text() == PATH
-    (kept / "path.csv").write_text(PATH.replace("0.8", "0.9"))  # of a robot on another machine
+    (kept / "path.csv").write_text(PATH.replace("0.8", "0.9"))  # path of a robot on another machine
     sent = document.received(document.case_document(read.plan).decode(), str(kept / "robot"))
     plan = read.plan.legs_by_robot["CF01"][0].planner
     assert sent.plan.legs_by_robot["CF01"][0].planner.target(4.0, (0, 0, 0), 0.0) == pytest.approx(
