@@ -19,13 +19,25 @@ if TYPE_CHECKING:
     from agents.network.messages import RunOrder
     from agents.plugins.avoidance import Avoidance, measure_gap
     from agents.plugins.cells import law_file
-    from agents.plugins.law import Control, Law, Measure, Memory, RobotFacts, Said, View
+    from agents.plugins.law import (
+        Control,
+        Law,
+        Measure,
+        Memory,
+        NeighbourView,
+        RobotFacts,
+        Said,
+        Severity,
+        Values,
+        View,
+        is_known,
+    )
     from agents.plugins.laws import Gradient
     from agents.plugins.planners import Planner
     from agents.plugins.predictors import Predictor
     from agents.plugins.registry import PluginError
     from agents.plugins.triggers import Trigger
-    from agents.vectors import Vector, clamp, distance, norm, wrap
+    from agents.vectors import NotNegative, Positive, Vector, clamp, difference, distance, norm, wrap
     from experiments.check.check import check, figures
     from experiments.definition import formation, graph, rigidity
     from experiments.file.document import Document, load, loads
@@ -50,7 +62,8 @@ __all__ = [  # noqa: RUF022 - by subject, as in docs/python.md
     # more of experiments
     "Document", "figures", "reopen_seeds", "folder", "law_file",
     # what laws and metrics get and raise
-    "View", "Memory", "Measure", "RobotFacts", "Link", "PluginError", "Measurement", "Array",
+    "View", "NeighbourView", "Memory", "Values", "is_known", "Measure", "RobotFacts", "Severity", "Link", "PluginError",
+    "Measurement", "Array", "Positive", "NotNegative",
     # other bases of plug-ins
     "Predictor", "Avoidance", "measure_gap", "EngineFactory", "PointMassEngine", "moving_models",
     # kinds and bodies
@@ -59,7 +72,7 @@ __all__ = [  # noqa: RUF022 - by subject, as in docs/python.md
     # readers of motion capture
     "CaptureReader", "CaptureFrame", "MeasuredPose", "MalformedStream",
     # vectors
-    "Vector", "norm", "distance", "clamp", "wrap",
+    "Vector", "norm", "distance", "difference", "clamp", "wrap",
     # orders to a run in real time
     "RunOrder", "Keys", "send_run_order",
     # modules of theory and of figures

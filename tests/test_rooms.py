@@ -148,6 +148,18 @@ def test_core_imports_no_device():
     assert {name for name in users if not name.startswith("bridges.")} == IMPORTS_DEVICES.keys()
 
 
+def test_gallery_imports_zenpark_alone():
+    """Laws of the literature, and those with heavy libraries, import `zenpark` and none of our modules but siblings."""
+    foreign = [
+        f"{name} imports {other}"
+        for name, others in imports().items()
+        if name.startswith(("agents.plugins.gallery.", "agents.plugins.extras."))
+        for other in others
+        if other.rpartition(".")[0] != name.rpartition(".")[0]
+    ]
+    assert not foreign
+
+
 def test_no_circle():
     try:
         TopologicalSorter(imports()).prepare()

@@ -1,4 +1,4 @@
 """Laws with libraries that are extras of zenpark, imported at first use.
 
-May import: agents.plugins, agents.vectors.
+May import: nothing.
 """

@@ -10,9 +10,22 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
 import msgspec
 from msgspec import Meta
 
-from agents.plugins.law import Control, Law, Measure, Memory, NeighbourView, RobotFacts, Said, Severity, View, is_known
-from agents.plugins.registry import PluginError
-from agents.vectors import NotNegative, Positive, clamp
+from zenpark import (
+    Control,
+    Law,
+    Measure,
+    Memory,
+    NeighbourView,
+    NotNegative,
+    PluginError,
+    Positive,
+    RobotFacts,
+    Said,
+    Severity,
+    View,
+    clamp,
+    is_known,
+)
 
 if TYPE_CHECKING:
     import numpy as np

@@ -10,8 +10,7 @@ from typing import Annotated, Any, ClassVar, Final
 
 from msgspec import Meta
 
-from agents.plugins.law import Control, Law, Measure, Memory, RobotFacts, Severity, View
-from agents.plugins.registry import PluginError
+from zenpark import Control, Law, Measure, Memory, PluginError, RobotFacts, Severity, View
 
 OWN: Final = 4  # numbers of a robot's own motion in an observation
 EACH: Final = 4  # numbers of each neighbour

@@ -1,4 +1,4 @@
-"""Laws of the literature, each with the theorem that its test shows.
+"""Laws of the literature, each with the theorem that its test shows; written as plug-ins of a user are.
 
-May import: agents.plugins, agents.vectors.
+May import: nothing.
 """

@@ -10,8 +10,7 @@ import msgspec
 from msgspec import Meta
 
 from agents.plugins.gallery.average import MOST_STEP, Averaging
-from agents.plugins.law import Control, Memory, RobotFacts, Said, Severity, View
-from agents.vectors import NotNegative, Positive
+from zenpark import Control, Memory, NotNegative, Positive, RobotFacts, Said, Severity, View
 
 Place = tuple[float, float]
 

@@ -9,8 +9,7 @@ from typing import Annotated, Any, ClassVar, Final
 import msgspec
 from msgspec import Meta
 
-from agents.plugins.law import Control, Law, Measure, Memory, RobotFacts, Said, Severity, View
-from agents.vectors import NotNegative, Positive
+from zenpark import Control, Law, Measure, Memory, NotNegative, Positive, RobotFacts, Said, Severity, View
 
 Place = tuple[float, float]
 

@@ -10,8 +10,7 @@ from typing import Annotated, Any, ClassVar, Final
 import msgspec
 from msgspec import Meta
 
-from agents.plugins.law import Control, Law, Memory, NeighbourView, RobotFacts, Said, Severity, Values, View
-from agents.vectors import Positive
+from zenpark import Control, Law, Memory, NeighbourView, Positive, RobotFacts, Said, Severity, Values, View
 
 MOST_STEP: Final = 2.0  # limit of Euler's method on a decay: rate times step
 STANDING: Final = 1e-9  # eigenvalues below are 0: of what the robots have in common

@@ -9,8 +9,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from agents.plugins.law import Control, Law, View
-from agents.vectors import Positive
+from zenpark import Control, Law, Positive, View
 
 
 class Consensus(Law, frozen=True):

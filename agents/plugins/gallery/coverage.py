@@ -9,8 +9,7 @@ from typing import Annotated, ClassVar
 import msgspec
 from msgspec import Meta
 
-from agents.plugins.law import Control, Law, Measure, Memory, View
-from agents.vectors import Positive
+from zenpark import Control, Law, Measure, Memory, Positive, View
 
 Place = tuple[float, float]
 

@@ -8,8 +8,7 @@ from typing import Annotated, ClassVar
 
 from msgspec import Meta
 
-from agents.plugins.law import Control, Law, View
-from agents.vectors import Positive
+from zenpark import Control, Law, Positive, View
 
 
 class CyclicPursuit(Law, frozen=True):

@@ -8,8 +8,7 @@ from typing import Annotated, ClassVar
 
 from msgspec import Meta
 
-from agents.plugins.law import Control, Law, Measure, Memory, RobotFacts, Said, View, is_known
-from agents.vectors import Positive
+from zenpark import Control, Law, Measure, Memory, Positive, RobotFacts, Said, View, is_known
 
 
 class Enclosing(Law, frozen=True):

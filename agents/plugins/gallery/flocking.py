@@ -7,8 +7,7 @@ from typing import Annotated, ClassVar
 
 from msgspec import Meta
 
-from agents.plugins.law import Control, Law, Memory, RobotFacts, View
-from agents.vectors import NotNegative, Positive
+from zenpark import Control, Law, Memory, NotNegative, Positive, RobotFacts, View
 
 EPSILON = 5.0  # parameter of the σ-norm, where lengths are in spacings
 INTERACTION_RANGE = 1.2  # spacings at which robots act on each other

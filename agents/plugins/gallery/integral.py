@@ -8,8 +8,7 @@ from typing import Annotated, ClassVar
 
 from msgspec import Meta
 
-from agents.plugins.law import Control, Law, Measure, Memory, Need, RobotFacts, View
-from agents.vectors import Positive
+from zenpark import Control, Law, Measure, Memory, Positive, RobotFacts, View
 
 
 class Integral(Law, frozen=True):
@@ -23,7 +22,7 @@ class Integral(Law, frozen=True):
     asks for more than `most`.
     """
 
-    NEEDS: ClassVar[Need] = "relative"
+    NEEDS = "relative"
     MEASURES: ClassVar[Mapping[str, Measure]] = {"error": Measure("m")}
 
     gain: Annotated[Positive, Meta(description="k [1/s]")] = 0.5

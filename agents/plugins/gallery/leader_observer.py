@@ -8,8 +8,7 @@ from typing import Annotated, ClassVar
 
 from msgspec import Meta
 
-from agents.plugins.law import Control, Law, Measure, Memory, Need, RobotFacts, Said, View
-from agents.vectors import Positive
+from zenpark import Control, Law, Measure, Memory, Positive, RobotFacts, Said, View
 
 
 class LeaderObserver(Law, frozen=True):
@@ -25,7 +24,7 @@ class LeaderObserver(Law, frozen=True):
     All transmit their number of links from a leader: without a leader it grows to the number of robots, and v̂ is 0.
     """
 
-    NEEDS: ClassVar[Need] = "relative"
+    NEEDS = "relative"
     PREDICTION: ClassVar[str] = "constant-velocity"
     MEASURES: ClassVar[Mapping[str, Measure]] = {"lag": Measure("m")}
     SAYS: ClassVar[Mapping[str, Said]] = {

@@ -11,8 +11,21 @@ from typing import Annotated, Any, ClassVar, Final, Literal
 
 from msgspec import Meta
 
-from agents.plugins.law import Control, Law, Measure, Memory, RobotFacts, Said, Severity, Values, View, is_known
-from agents.vectors import Positive, Vector, difference
+from zenpark import (
+    Control,
+    Law,
+    Measure,
+    Memory,
+    Positive,
+    RobotFacts,
+    Said,
+    Severity,
+    Values,
+    Vector,
+    View,
+    difference,
+    is_known,
+)
 
 Matrix = Sequence[Sequence[float]]  # 4 × 4, for a state of x, y [m] and v_x, v_y [m/s]
 Information = tuple[Sequence[float], Matrix]  # y = Y x and Y = P⁻¹
