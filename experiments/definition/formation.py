@@ -12,10 +12,10 @@ import numpy as np
 
 from agents.body.kinds import KINDS, Flight, Kind
 from agents.formation import anchors
-from agents.formation.changes import Change, Target, change_target, exists, planned_at
-from agents.formation.link import BY_DISTANCE, BY_NOTHING, Link
-from agents.plugins.law import Law
-from agents.plugins.laws import Distance, Gradient
+from agents.formation.changes import ROUNDING_S, Change, Target, change_target, exists, planned_at
+from agents.formation.link import BY_DISTANCE, BY_NOTHING, BY_RELATIVE, Link
+from agents.plugins.law import WANTS, Law
+from agents.plugins.laws import Displacement, Distance, Gradient
 from experiments.definition.experiment import AnchorTable, ChangeTable, Experiment
 from experiments.definition.graph import Links
 from experiments.definition.links import OneWay, held_height, link_pairs, link_target
@@ -30,6 +30,7 @@ BRACED: Final = 1.4  # bound by lengths of links of a braced formation, as a mul
 TO_ORIGIN: Final = 2.0  # gain of an anchor, of that of a link: as the authors' controllers pull to the origin
 MOST_ROBOTS: Final = 300  # eigenvalues of more take longer than the run
 TINY: Final = 1e-9
+BY_TARGET: Final = (Law.error, Displacement.error, Distance.error)  # errors by the target that a law needs
 AT_ONCE: Final = 2_000_000  # distances of links that are held in memory at once
 
 
@@ -92,10 +93,14 @@ class Pattern:
         if not self.bounded:
             return None
         apart = norm(position[:, self.links.receiver] - position[:, self.links.sender])
-        there = np.empty(apart.shape, dtype=bool)
-        for number, now in enumerate(self.planned_at(0.0).tolist()):
-            for k, (t, far) in enumerate(zip(time.tolist(), apart[:, number].tolist(), strict=True)):
-                there[k, number] = now = self.exists(number, t, far, was=now)  # noqa: PLW2901
+        since, until, reach, release = np.array(
+            [(each.since, each.until, each.reach, each.release) for each in self.one_way]
+        ).T
+        within = (since - ROUNDING_S <= time[:, None]) & (time[:, None] < until - ROUNDING_S)
+        there, now = np.empty(apart.shape, dtype=bool), self.planned_at(0.0)
+        for k, far in enumerate(apart):
+            limit = np.where(now, release, reach)
+            there[k] = now = within[k] & ((limit == math.inf) | (far <= limit))
         return there
 
     def exists(self, number: int, elapsed: float, apart: float, *, was: bool) -> bool:
@@ -197,13 +202,24 @@ def errors_over_time(law: Law, pattern: Pattern, time: Array, position: Array) -
             part = position[k : k + step]
             error[k : k + step] = np.abs(norm(part[:, links.receiver] - part[:, links.sender]) - links.distance)
     else:
-        error = np.empty((len(time), len(links)))
-        targets = pattern.targets_at(0.0)
-        for k, t in enumerate(time.tolist()):
-            targets = pattern.targets_at(t) if pattern.changes else targets
-            apart = (position[k, links.receiver] - position[k, links.sender]).tolist()
-            error[k] = [law.error(tuple(away), link) for away, link in zip(apart, targets, strict=True)]
-        error[:, ~targeted(law, pattern)] = np.nan
+        error = np.full((len(time), len(links)), np.nan)
+        columns = targeted(law, pattern).nonzero()[0].tolist()
+        apart = (position[:, links.receiver[columns]] - position[:, links.sender[columns]]) if columns else position
+        wants = WANTS.get(law.NEEDS)
+        if wants in (BY_DISTANCE, BY_RELATIVE) and columns and type(law).error in BY_TARGET and not pattern.changes:
+            targets = [pattern.one_way[each].target for each in columns]
+            if wants == BY_RELATIVE:
+                apart = apart - np.array([to.relative for to in targets])
+            x, y, z = np.moveaxis(apart, 2, 0)
+            length = np.sqrt(x * x + y * y + z * z)  # sums as `agents.vectors.norm` has them
+            wanted = np.array([to.distance for to in targets])
+            error[:, columns] = length if wants == BY_RELATIVE else np.abs(wanted - length)
+        elif columns:
+            for k, (t, row) in enumerate(zip(time.tolist(), apart.tolist(), strict=True)):
+                if k == 0 or pattern.changes:
+                    every = pattern.targets_at(t)
+                    targets = [every[each] for each in columns]
+                error[k, columns] = [law.error(tuple(away), link) for away, link in zip(row, targets, strict=True)]
     there = pattern.present(time, position)
     return error if there is None else np.where(there, error, np.nan)
 

@@ -165,7 +165,7 @@ TAKEN: Final = {  # columns of tables
 LEAN: Final = frozenset(
     {
         *("case", "plan", "seed", "robots", "clock", "time", "true_position", "events", "dropped"),
-        *("ticks", "decisions", "interventions", "avoided", "lost", "missed_deadlines"),
+        *("ticks", "decisions", "interventions", "avoided", "lost", "missed_deadlines", "measures"),
     }
 )
 _COLUMNS: Final = frozenset(each.name for each in fields(Trace))

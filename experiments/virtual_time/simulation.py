@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import Any, Final
 
 import numpy as np
@@ -15,7 +16,6 @@ import numpy as np
 from agents.body.interface import BodyState
 from agents.body.shadow_twin import shadowed
 from agents.plugins.calls import explain, supervised
-from agents.plugins.law import Memory
 from agents.plugins.registry import FAILURES
 from agents.robot import Robot
 from agents.safety.hazards import HazardChange
@@ -69,7 +69,7 @@ class VirtualRunLog:
     shadow_position: Array | None
     shadow_yaw: Array | None  # (K, N) of those twins
     says: Mapping[str, int] = field(default_factory=dict)  # sizes of variables beside poses, which are `sent.extra`
-    # of laws that remember, by name: variables (K, N, k), and measures (K, N), NaN where unknown; empty if lean
+    # of laws that remember, by name: variables (K, N, k), none if lean, and measures (K, N); NaN where unknown
     memory: Mapping[str, Array] = field(default_factory=dict)
     measures: Mapping[str, Array] = field(default_factory=dict)
     velocities: tuple[bool, ...] = ()  # (N) robots with a velocity from the last step of their law
@@ -105,8 +105,8 @@ def simulate(
     Args:
         seed: Of all that is random.
         quiet: Fly without noise.
-        lean: Keep `true_position`, and of the poses sent numbers and times: a seventh of the memory, for sweeps. The
-            other columns are empty, and so is the table of received poses.
+        lean: Keep `true_position`, measures of laws, and of the poses sent numbers and times: a seventh of the memory,
+            for sweeps. The other columns are empty, and so is the table of received poses.
         landing: Let the robots land; else the log ends with the run.
         progress: Called at state_hz with the time of the experiment [s]; NaN before its start is known.
         watch: Called at state_hz, and as slow as it likes.
@@ -154,8 +154,7 @@ class VirtualRun:
         self._samples: list[dict[str, Any]] = []
         self._columns: dict[str, list[Array]] = {}
         self._touches: list[Touch] = []
-        # memory and measures of each robot at each sample
-        self._remembered: list[list[tuple[Memory, Mapping[str, float]]]] = []
+        self._memory, self._measures = LawColumns(), LawColumns()
 
     def fly(
         self, *, landing: bool, progress: Callable[[float], object], watch: Callable[[Snapshot], object] | None
@@ -229,13 +228,16 @@ class VirtualRun:
         """Note the state of all robots."""
         states = [robot.now.state for robot in self.robots]
         sample: dict[str, Any] = {"time": t, "true_position": [state.true_position for state in states]}
+        if any(self._laws):
+            self._measures.add([{} if law is None else law.measures for law in self._laws])
+            if not self.lean:
+                self._memory.add([{} if law is None else law.memory for law in self._laws])
         if not self.lean:
             for what in (*STATE, *OPTIONAL):
                 sample[what] = [getattr(state, what) for state in states]
             sample["phase"] = [robot.lifecycle.phase for robot in self.robots]
             for what in ("goal", "setpoint", "error"):
                 sample[what] = [getattr(robot, what) for robot in self.robots]
-            self._remembered.append([({}, {}) if law is None else (law.memory, law.measures) for law in self._laws])
             sample["obstacles"] = [tuple(each) for each in self.twin.engine.obstacles]
         self._samples.append(sample)
 
@@ -245,12 +247,15 @@ class VirtualRun:
         count, rows = ledger.sample, len(self.robots)
         columns = self._columns
         columns.setdefault("time", []).append(np.array(ledger.times[:count]))
+        for memory, measures in steps.remembered(ledger.times[:count]):
+            self._measures.add(measures)
+            if not self.lean:
+                self._memory.add(memory)
         wide = LEAN if self.lean else WIDTH
         numbers = np.frombuffer(ledger.samples)[: count * rows * wide].reshape(count, rows, wide)
         if self.lean:
             columns.setdefault("true_position", []).append(numbers.copy())
             return
-        self._remembered += steps.remembered(ledger.times[:count])
         for what, (begin, end) in PLACES.items():
             column = numbers[:, :, begin] if end == begin + 1 else numbers[:, :, begin:end]
             columns.setdefault(what, []).append(column.copy())
@@ -297,8 +302,8 @@ class VirtualRun:
             ticks=round(self.plan.experiment.duration_s / self.dt),
             airborne=conductor.airborne_at - begin,
             ended=self._tick * self.dt - begin,
-            memory=_columns([[memory for memory, _ in each] for each in self._remembered]),
-            measures=_columns([[measures for _, measures in each] for each in self._remembered]),
+            memory=self._memory.columns(),
+            measures=self._measures.columns(),
             velocities=tuple(law is not None and law.control.velocity is not None for law in self._laws),
             incidents=tuple(
                 (row, each._replace(time=each.time - begin))
@@ -309,12 +314,34 @@ class VirtualRun:
         )
 
 
-def _columns(samples: Sequence[Sequence[Mapping[str, Any]]]) -> dict[str, Array]:
-    """Values by name of samples (K) of N robots: (K, N) or (K, N, k); NaN where one is missing."""
-    blank: dict[str, Array] = {}
-    for rows in samples:
-        for row in rows:
-            blank |= {
-                name: np.full_like(value, np.nan, dtype=float) for name, value in row.items() if name not in blank
+class LawColumns:
+    """Variables or measures of the laws of N robots, by name, as columns over samples."""
+
+    def __init__(self) -> None:
+        self._parts: list[tuple[int, dict[str, Array]]] = []  # numbers of samples, each with their columns
+        self._last: list[Sequence[Mapping[str, Any]]] = []
+
+    def add(self, sample: Sequence[Mapping[str, Any]]) -> None:
+        """Add a sample, by robot."""
+        self._last.append(sample)
+
+    def columns(self) -> dict[str, Array]:
+        """(K, N) of numbers, (K, N, k) of tuples; NaN where a robot has no such value."""
+        self._settle()
+        blank = {name: np.full_like(column[0], np.nan) for _, part in self._parts for name, column in part.items()}
+        return {
+            name: np.concatenate([part.get(name, np.repeat(none[None], k, axis=0)) for k, part in self._parts])
+            for name, none in blank.items()
+        }
+
+    def _settle(self) -> None:
+        if self._last:
+            blank: dict[str, Array] = {}
+            for row in chain.from_iterable(self._last):
+                blank |= {name: np.full_like(row[name], np.nan, dtype=float) for name in row if name not in blank}
+            columns = {
+                name: np.array([[row.get(name, none) for row in rows] for rows in self._last], dtype=float)
+                for name, none in blank.items()
             }
-    return {name: np.array([[row.get(name, none) for row in rows] for rows in samples]) for name, none in blank.items()}
+            self._parts.append((len(self._last), columns))
+            self._last = []

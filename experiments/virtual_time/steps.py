@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import ctypes
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from math import inf
 from operator import attrgetter
 from typing import Any, Final, NamedTuple
@@ -132,12 +132,11 @@ class Steps:
                 for sender in robot.neighbours.all:
                     sender.said = self._said[id(sender)]
 
-    def remembered(self, times: Sequence[float]) -> list[list[tuple[Memory, Mapping[str, float]]]]:
-        """Memory and measures of all robots at these times [s]."""
-        if not self._rows:
-            return []
-        samples = [[self._at(row, t) for row in range(len(self._robots))] for t in times]
-        return [[(each.memory, each.measures) for each in row] for row in samples]
+    def remembered(self, times: Sequence[float]) -> Iterator[tuple[list[Memory], list[Mapping[str, float]]]]:
+        """Memory and measures of all robots at each of these times [s]."""
+        for t in times if self._rows else ():
+            steps = [self._at(row, t) for row in range(len(self._robots))]
+            yield [each.memory for each in steps], [each.measures for each in steps]
 
 
 def _step_of(law: Stepping, t: float) -> Step:
