@@ -13,7 +13,9 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
 import time
+from collections.abc import Callable
 from math import isfinite
 from typing import Final
 
@@ -27,6 +29,17 @@ _UPTIME: Final = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
 def uptime() -> float:
     """Time [s] since the machine was started, on a clock that goes on while the machine sleeps."""
     return time.clock_gettime(_UPTIME)
+
+
+def wait_until(
+    true: Callable[[], object], limit_s: float, pause_s: float = 0.02, stop: threading.Event | None = None
+) -> bool:
+    """Wait until something is true, at most `limit_s` [s], or until `stop` is set; returns whether it was true."""
+    deadline, pause = time.monotonic() + limit_s, time.sleep if stop is None else stop.wait
+    while not true():
+        if time.monotonic() >= deadline or pause(pause_s):
+            return False
+    return True
 
 
 def correction_line(correction_s: float) -> bytes:

@@ -1,5 +1,8 @@
 """Base of the errors that a user can mend: a command prints them without a traceback and ends with exit code 2."""
 
+import difflib
+from collections.abc import Iterable
+
 
 class ExplainedError(Exception):
     """An error with a text that names the place and the remedy."""
@@ -7,3 +10,13 @@ class ExplainedError(Exception):
 
 class Refusal(Exception):
     """An order that is not carried out, with reason and remedy."""
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """The nearest known word as a question, or the list of all when none is near; empty when nothing is known."""
+    words = list(known)
+    lower = {each.lower(): each for each in words}
+    near = difflib.get_close_matches(word.lower()[:80], lower, n=1)
+    if near:
+        return f"did you mean '{lower[near[0]]}'?"
+    return f"known: {', '.join(words)}" if words else ""

@@ -19,7 +19,7 @@ from msgspec import Meta
 from agents.body.external_pose import External
 from agents.body.interface import UNANSWERED, Body, BodyError, BodyRequest, BodyState, settings
 from agents.body.measured_positions import MeasuredPositions
-from agents.clock import uptime
+from agents.clock import uptime, wait_until
 from agents.errors import ExplainedError
 from agents.network import messages, pubsub
 from agents.network import session as network
@@ -145,10 +145,8 @@ class ExternalBody(Body):
         self._orders = [
             pubsub.publisher(session, keys.setpoint(name), mime, zenoh.Priority.REAL_TIME) for name in self._names
         ]
-        pause = threading.Event()
-        while (missing := self._missing_positions()) and time.monotonic() < deadline:
-            pause.wait(POLL_S)
-        if missing:
+        wait_until(lambda: not self._missing_positions(), deadline - time.monotonic(), POLL_S)
+        if missing := self._missing_positions():
             self.close()
             raise BodyError("\n".join(missing))
 

@@ -99,7 +99,7 @@ def __getattr__(name: str) -> Any:  # noqa: ANN401 - a class, a function or a mo
     if name not in __all__:
         message = f"module 'zenpark' has no attribute {name!r}"
         if not name.startswith("__"):  # those Python itself asks for
-            from agents.plugins.registry import did_you_mean  # noqa: PLC0415 - in trouble only
+            from agents.errors import did_you_mean  # noqa: PLC0415 - in trouble only
 
             message += f"; {did_you_mean(name, __all__)}"
         raise AttributeError(message, name=name)

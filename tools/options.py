@@ -288,7 +288,7 @@ def session(
 
 def known_words(option: str, given: Sequence[str], known: Collection[str]) -> list[str]:
     """Words behind an option, also with commas between them; raises DocumentError for one that is not `known`."""
-    from agents.plugins.registry import did_you_mean
+    from agents.errors import did_you_mean
     from experiments.file.problems import refusal
 
     words = [word.strip() for part in given for word in part.split(",") if word.strip()]

@@ -8,7 +8,6 @@ stand in a file as well, see `agents.plugins.files`.
 
 from __future__ import annotations
 
-import difflib
 import re
 import sys
 from collections.abc import Callable, Iterable, Mapping
@@ -21,7 +20,7 @@ from typing import Any, ClassVar, Final, Literal, Protocol, get_args, get_origin
 
 import msgspec
 
-from agents.errors import ExplainedError
+from agents.errors import ExplainedError, did_you_mean
 from agents.plugins import files
 
 BODIES: Final = "zenpark.bodies"
@@ -65,16 +64,6 @@ class PluginError(ExplainedError, ValueError):
 
 class UnknownPlugin(PluginError):
     """No plug-in has this name."""
-
-
-def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """The nearest known word as a question, or the list of all when none is near; empty when nothing is known."""
-    words = list(known)
-    lower = {each.lower(): each for each in words}
-    near = difflib.get_close_matches(word.lower()[:80], lower, n=1)
-    if near:
-        return f"did you mean '{lower[near[0]]}'?"
-    return f"known: {', '.join(words)}" if words else ""
 
 
 def names(group: str) -> list[str]:

@@ -11,7 +11,7 @@ from typing import Final
 from agents.body.device_locks import Claims
 from agents.body.external_pose import External
 from agents.body.interface import Body, BodyEntry, BodyError, BodyFault, BodyRequest, BodyState, RangeScan
-from agents.clock import uptime
+from agents.clock import uptime, wait_until
 from agents.network.messages import Inspection, number
 from agents.vectors import UNKNOWN, Setpoint, Vector
 from bridges.crazyflie.file_faults import file_faults
@@ -97,11 +97,7 @@ class CrazyflieBody(Body):
         self._claims.take()
         for pilot in self.pilots:
             pilot.start()
-        deadline = uptime() + self._open_timeout
-        waiting = list(self.pilots)
-        while waiting and uptime() < deadline:
-            time.sleep(POLL_S)
-            waiting = [pilot for pilot in waiting if not pilot.opened.is_set() and pilot.failure is None]
+        wait_until(lambda: all(pilot.opened.is_set() or pilot.failure for pilot in self.pilots), self._open_timeout)
         if not any(pilot.opened.is_set() for pilot in self.pilots):
             self.close()
             failures = [pilot.failure for pilot in self.pilots if pilot.failure is not None]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -12,7 +11,7 @@ from typing import Any, Final
 import msgspec
 
 from agents.body.interface import BodyError
-from agents.clock import uptime
+from agents.clock import uptime, wait_until
 from agents.vectors import Vector
 from bridges.crazyflie.geometry import StationFile, Sweep, check_anchors, stations
 from bridges.crazyflie.link import REPEAT_S, CrazyflieLink, LinkError
@@ -211,16 +210,9 @@ def _anchors(link: CrazyflieLink, memory: Any) -> dict[int, tuple[float, float, 
 
 def _await_answer(link: CrazyflieLink, ask: Callable[[Callable[[Any], None]], object], what: str) -> Any:  # noqa: ANN401 - cflib's own objects
     """Call `ask` with a callback, and return the callback's argument; raises LinkError if cflib never calls back."""
-    received = threading.Event()
     answers: list[object] = []
-
-    def receive(answer: object) -> None:
-        answers.append(answer)
-        received.set()
-
-    ask(receive)
-    deadline = uptime() + UPLOAD_S
-    while not received.wait(0.02):
-        if link.error is not None or uptime() > deadline:
-            raise LinkError(f"no answer: {what}")
+    ask(answers.append)
+    wait_until(lambda: answers or link.error is not None, UPLOAD_S)
+    if not answers:
+        raise LinkError(f"no answer: {what}")
     return answers[0]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Final
@@ -23,7 +22,7 @@ from agents.body.interface import (
     settings,
     shared_devices,
 )
-from agents.clock import uptime
+from agents.clock import uptime, wait_until
 from agents.network.messages import Inspection
 from agents.vectors import Setpoint, Vector
 from bridges.khepera4 import protocol
@@ -75,11 +74,7 @@ class KheperaBody(Body):
         self._links = links
         for link in links:
             link.start()
-        deadline, pause = uptime() + self._open_s, threading.Event()
-        while uptime() < deadline and any(
-            link.odometry.stamp == -math.inf and not link.refused for link in self._links
-        ):
-            pause.wait(0.01)
+        wait_until(lambda: all(link.odometry.stamp > -math.inf or link.refused for link in links), self._open_s)
         if all(link.odometry.stamp == -math.inf for link in self._links):
             reasons = [f"{name}: {link.trouble}" for name, link in zip(self._names, self._links, strict=True)]
             self.close()

@@ -30,7 +30,7 @@ from agents.body.interface import (
     settings,
     shared_devices,
 )
-from agents.clock import uptime
+from agents.clock import uptime, wait_until
 from agents.vectors import UNKNOWN, ZERO, Setpoint, Vector
 from bridges.tello import protocol
 from bridges.tello.library import TelloLibrary, filters_answers
@@ -107,9 +107,8 @@ class TelloBody(Body):
         self._ending.clear()
         self._thread = threading.Thread(target=self._run, args=(library,), name="tello pilots", daemon=True)
         self._thread.start()
-        deadline = uptime() + self._open_s
-        while uptime() < deadline and any(pilot.state_received == -math.inf for pilot in self.pilots):
-            self._ending.wait(0.02)
+        pilots, ending = self.pilots, self._ending
+        wait_until(lambda: all(pilot.state_received > -math.inf for pilot in pilots), self._open_s, stop=ending)
         if all(pilot.state_received == -math.inf for pilot in self.pilots):
             now = uptime()
             reasons = [

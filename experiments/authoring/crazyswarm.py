@@ -18,8 +18,8 @@ from typing import Annotated, Any, Final
 from msgspec import Meta, Struct
 
 from agents.body.interface import BodyError
+from agents.errors import did_you_mean
 from agents.plugins import registry
-from agents.plugins.registry import did_you_mean
 from bridges.crazyflie.protocol import addresses as protocol
 from experiments.authoring.robotic_park.file import MISSING, YamlValue, load, text_of
 from experiments.catalogue import index

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from agents.body.kinds import KINDS, Kind
-from agents.plugins.registry import did_you_mean
+from agents.errors import did_you_mean
 from experiments.authoring import layouts
 from experiments.authoring.layouts import Layout, LayoutError
 from experiments.catalogue import index

@@ -11,11 +11,11 @@ import numpy as np
 
 from agents.decision.goals import GoalComputer
 from agents.decision.stepping import Stepping
+from agents.errors import did_you_mean
 from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_RELATIVE
 from agents.network import messages
 from agents.plugins.calls import unknown_reads
 from agents.plugins.laws import Gradient
-from agents.plugins.registry import did_you_mean
 from agents.vectors import ZERO
 from experiments.check.analysis import FAR_OFF, Analysis
 from experiments.check.findings import FORGIVEN, Finding, Severity, join_names

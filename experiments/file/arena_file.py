@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import msgspec
 
-from agents.plugins.registry import did_you_mean
+from agents.errors import did_you_mean
 from experiments.catalogue import index
 from experiments.definition.experiment import Arena, FileTable
 from experiments.file import structure

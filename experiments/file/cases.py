@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
-from agents.plugins.registry import did_you_mean
+from agents.errors import did_you_mean
 from experiments.file import arena_file
 from experiments.file.arena_file import ArenaFile
 from experiments.file.choices import group_of

@@ -5,7 +5,7 @@ from __future__ import annotations
 import tomllib
 from pathlib import Path
 
-from agents.plugins.registry import did_you_mean
+from agents.errors import did_you_mean
 from experiments.catalogue import index
 from experiments.file import arena_file
 from experiments.file.arena_file import ArenaFile

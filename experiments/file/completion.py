@@ -10,9 +10,9 @@ from typing import Any, Final, cast
 
 import msgspec
 
+from agents.errors import did_you_mean
 from agents.plugins import registry
 from agents.plugins.law import Law
-from agents.plugins.registry import did_you_mean
 from experiments.catalogue import index
 from experiments.definition.experiment import TARGETS, Formation
 from experiments.definition.links import TARGET_KINDS, link_pairs, pairs_or_none

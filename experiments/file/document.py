@@ -15,11 +15,11 @@ from typing import Any, Final
 
 import msgspec
 
+from agents.errors import did_you_mean
 from agents.plugins import files, registry
 from agents.plugins.calls import supervised
 from agents.plugins.cells import law_file
 from agents.plugins.law import Law
-from agents.plugins.registry import did_you_mean
 from experiments.catalogue import index
 from experiments.definition.experiment import Experiment
 from experiments.definition.formation import calm_gain

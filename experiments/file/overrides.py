@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Any, Final
 
-from agents.plugins.registry import did_you_mean
+from agents.errors import did_you_mean
 from experiments.definition.experiment import Experiment
 from experiments.definition.links import pairs_or_none
 from experiments.file.choices import Adopted, group_of, parameters

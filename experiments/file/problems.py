@@ -16,9 +16,8 @@ from typing import Final
 
 import msgspec
 
-from agents.errors import ExplainedError
+from agents.errors import ExplainedError, did_you_mean
 from agents.plugins.files import plain
-from agents.plugins.registry import did_you_mean
 
 Path = tuple[str | int, ...]
 

@@ -14,8 +14,8 @@ from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
 
 import msgspec
 
+from agents.errors import did_you_mean
 from agents.plugins import files, registry
-from agents.plugins.registry import did_you_mean
 from experiments.definition.experiment import LONGEST_NAME, Experiment
 from experiments.file.choices import fields_of, group_of, parameters, struct_of
 from experiments.file.problems import DocumentError, Fault, Path, Problem, key_name, refusal, shown

@@ -20,6 +20,7 @@ from typing import Any, ClassVar, Final, Literal, cast
 import msgspec
 import numpy as np
 
+from agents.errors import did_you_mean
 from agents.plugins import files, registry
 from agents.plugins.calls import supervised
 from agents.plugins.law import Measure
@@ -332,9 +333,7 @@ def usable_metric(name: str) -> Metric:
     elif not isinstance(plugin.label, str) or not plugin.label or not isinstance(plugin.unit, str):
         wrong = "label and unit must be texts, and the label not empty"
     elif bad := [each for each in plugin.needs if each not in _COLUMNS]:
-        wrong = (
-            f"needs names {bad[0]!r}, and a trace has no such field: {registry.did_you_mean(bad[0], sorted(_COLUMNS))}"
-        )
+        wrong = f"needs names {bad[0]!r}, and a trace has no such field: {did_you_mean(bad[0], sorted(_COLUMNS))}"
     if wrong:
         raise registry.PluginError(wrong)
     return plugin()

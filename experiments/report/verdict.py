@@ -6,7 +6,7 @@ import statistics
 from collections import Counter
 from collections.abc import Iterator, Sequence
 
-from agents.plugins.registry import did_you_mean
+from agents.errors import did_you_mean
 from experiments.metrics import criteria
 from experiments.metrics.comparable import LOST, MISSED, SLOW, equally_long, lost_share, spoils
 from experiments.metrics.metric import ERRORS, OURS

@@ -20,9 +20,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
-from agents.errors import ExplainedError
+from agents.errors import ExplainedError, did_you_mean
 from agents.plugins.files import plain
-from agents.plugins.registry import did_you_mean
 from experiments.file.document import Document, chosen, load
 from experiments.file.problems import refusal
 from experiments.metrics.metric import OF_LAW, Metric, short_name, swept_metrics

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from agents.body.interface import BodyState
+from agents.clock import wait_until
 from agents.decision.lifecycle import RUNNING, Phase
 from agents.network.messages import Event, Status
 from experiments.definition.plan import Plan
@@ -59,8 +60,7 @@ class PacedView:
     def watch(self, instant: Snapshot) -> None:
         """Draws a moment of the simulation, and holds it until the clock of the page is there."""
         clock = self.clock
-        while not self._server.get_clients() and time.monotonic() - self._opened < self._page_s:
-            time.sleep(POLL_S)
+        wait_until(self._server.get_clients, self._opened + self._page_s - time.monotonic(), POLL_S)
         if clock.t == -inf:
             clock.t, self._waited = instant.now, time.monotonic()
         self._count(instant)

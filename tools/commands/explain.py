@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import sys
 import textwrap
 from collections.abc import Sequence
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 from typer import Argument
 
+from agents.errors import did_you_mean
 from experiments.catalogue import index
 from tools.options import WIDEST, AsJson, example, print_json, print_result, warn
 
@@ -50,8 +50,8 @@ def explain(
         table, words = key.partition(".")[0], [".".join(entry.words) for entry in reference.entries()]
         listed = [] if "." in key else reference.containing(key)[:LISTED]
         hint = f"`./zenpark explain{f' {table}' if reference.matching(table) else ''}` lists what there is"
-        if near := difflib.get_close_matches(key, words, 1):
-            hint = f"did you mean {near[0]!r}?"
+        if (near := did_you_mean(key, words)).startswith("did you mean"):
+            hint = near
         if key.lower() in {
             field for metric in RobotMetrics.__struct_fields__ for field in (metric, metric.split("_")[0])
         }:

@@ -63,8 +63,8 @@ def issue(
     as_json: AsJson = False,
 ) -> None:
     """Make certificates for more robots, people or routers."""
+    from agents.errors import did_you_mean
     from agents.network.lab import ROLES, LabError
-    from agents.plugins.registry import did_you_mean
     from experiments.real_time.hosts.authority import issue as made
 
     if role and role not in ROLES:

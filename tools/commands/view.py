@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Final, TextIO
 import typer
 from typer import Argument, Option
 
+from agents.clock import wait_until
 from agents.errors import ExplainedError
 from tools import completion
 from tools.options import (
@@ -126,17 +127,14 @@ class _Top:
 
     def run(self, ended: threading.Event, *, as_json: bool) -> int:
         """Draw until it is ended or the run is over; return the exit code."""
-        import time
 
         from rich.console import Console
         from rich.live import Live
 
         console = Console()
-        began, over = time.monotonic(), False
+        over = False
         if as_json or not console.is_terminal:
-            while not (over := self._all_reported()) and time.monotonic() - began < FIRST_S:
-                if ended.wait(POLL_S):
-                    break
+            over = wait_until(self._all_reported, FIRST_S, POLL_S, ended)
             if as_json:
                 seen = self._observer
                 print_json({"case": seen.case, "time_s": seen.elapsed, "robots": self._rows()})
@@ -293,15 +291,16 @@ def paced(pace: float) -> Iterator[Watch]:
 
 def _running_run(folder: Path, *, wait_s: float, ended: threading.Event) -> RegisteredRun | None:
     """The run of a folder, if it is up, or is within `wait_s` [s]."""
-    import time
 
     from experiments.real_time.hosts import run_registry
 
-    here, deadline = str(folder.absolute()), time.monotonic() + wait_s
-    while True:
-        found = next((run for run in run_registry.runs() if run.folder == here and run.alive), None)
-        if found is not None or time.monotonic() >= deadline or ended.wait(POLL_S):
-            return found
+    here = str(folder.absolute())
+
+    def found() -> RegisteredRun | None:
+        return next((run for run in run_registry.runs() if run.folder == here and run.alive), None)
+
+    wait_until(found, wait_s, POLL_S, ended)
+    return found()
 
 
 def _starting_run(folder: Path, ended: threading.Event) -> RegisteredRun | None:

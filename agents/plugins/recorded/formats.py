@@ -11,8 +11,8 @@ from itertools import pairwise
 from math import atan2, cos, hypot, isfinite, nan, radians, sin
 from typing import Final, NamedTuple
 
+from agents.errors import did_you_mean
 from agents.plugins.recorded.curves import AXES, ORDER, Curve, Piece, Polynomials, Samples, TimedPose
-from agents.plugins.registry import did_you_mean
 
 Rows = Sequence[tuple[int, list[str]]]  # numbers of lines, and their cells
 

@@ -20,7 +20,7 @@ import yaml
 from msgspec import Meta, Struct
 
 from agents.body.kinds import KINDS
-from agents.plugins.registry import did_you_mean
+from agents.errors import did_you_mean
 from experiments.file.problems import DocumentError, Problem, at_offset, refusal
 from experiments.file.text import content
 

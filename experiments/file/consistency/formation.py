@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
+from agents.errors import did_you_mean
 from agents.formation.link import BY_BEARING
-from agents.plugins.registry import did_you_mean
 from experiments.definition.experiment import NO_TARGET, ChangeTable, Experiment, TargetTable
 from experiments.definition.links import FORM, TARGET_KINDS, held_height, link_pairs
 from experiments.definition.plan import Plan

@@ -9,8 +9,8 @@ from typing import Final
 from agents.body.capture_reader import parse_server
 from agents.body.interface import BodyError
 from agents.body.kinds import KINDS, Kind
+from agents.errors import did_you_mean
 from agents.plugins import files, registry
-from agents.plugins.registry import did_you_mean
 from experiments.definition.bodies import body_faults, device_struct, driven_kind
 from experiments.definition.experiment import MEAN, TWIN, WORLD, WORST, Experiment, RobotTable
 from experiments.file.consistency.arena import WALL

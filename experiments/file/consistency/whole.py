@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator
 
 from agents.body.kinds import KINDS
+from agents.errors import did_you_mean
 from agents.plugins import files, registry
 from agents.plugins.laws import Gradient
 from agents.plugins.predictors import HOLD
-from agents.plugins.registry import did_you_mean
 from experiments.definition.experiment import JUDGED, MEAN, WORST, Experiment, Hybrid
 from experiments.definition.plan import Plan
 from experiments.file.choices import struct_of

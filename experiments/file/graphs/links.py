@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from agents.plugins.registry import did_you_mean
+from agents.errors import did_you_mean
 from experiments.definition.experiment import GraphTable
 from experiments.definition.links import pairs_or_none
 from experiments.file.completion import ALONE, content_of

@@ -17,11 +17,10 @@ import zenoh
 
 from agents.body.kinds import KINDS
 from agents.decision.lifecycle import PAUSED
-from agents.errors import Refusal
+from agents.errors import Refusal, did_you_mean
 from agents.network import messages
 from agents.network.keys import Keys
 from agents.plugins import registry
-from agents.plugins.registry import did_you_mean
 from agents.runtime.orders import LAND, STOP
 from experiments.definition.experiment import WORLD, RobotTable
 from experiments.definition.plan import Plan

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 import zenoh
 
+from agents.clock import wait_until
 from agents.network import endpoints as topology
 from agents.network import messages, pubsub
 from agents.network import session as network
@@ -296,13 +297,11 @@ class Emergency:
 
     def obey(self, stop: messages.Stop) -> run_registry.StopReport:
         """Receive a stop that needed no router; returns when all robots have stopped, or their time is over."""
-        deadline = time.monotonic() + STOP_ANSWER_S
         self.receive(stop)
-        while True:
-            robots = {} if self.launcher is None else self.launcher.stopped()
-            if all(robots.values()) or time.monotonic() > deadline:
-                return run_registry.StopReport(sorted(robots), sorted(name for name, down in robots.items() if down))
-            time.sleep(STOP_AGAIN_S)
+        stopped = dict[str, bool] if self.launcher is None else self.launcher.stopped
+        wait_until(lambda: all(stopped().values()), STOP_ANSWER_S, STOP_AGAIN_S)
+        robots = stopped()
+        return run_registry.StopReport(sorted(robots), sorted(name for name, down in robots.items() if down))
 
     @contextmanager
     def throughout(self, endpoints: Sequence[str], keys: Keys, identity: str, wait_s: float) -> Iterator[None]:

@@ -11,7 +11,7 @@ from typing import Final, Literal
 
 import zenoh
 
-from agents.clock import Clock
+from agents.clock import Clock, wait_until
 from agents.decision.lifecycle import FINISHED, SCRIPTED, TOLD_TO_END, Phase
 from agents.errors import ExplainedError
 from agents.network import endpoints as topology
@@ -126,14 +126,11 @@ def await_sole_conductor(session: zenoh.Session, keys: Keys) -> None:
 
     Raises RunFailed if one stays: its robots would get the orders of both.
     """
-    deadline = time.monotonic() + OTHERS_S
-    while network.tokens_present(session, keys.conductor):
-        if time.monotonic() > deadline:
-            raise RunFailed(
-                f"another run is up at this router, in the realm '{keys.realm}': its robots would take the orders of "
-                "both; wait for its end, or choose another network.realm"
-            )
-        time.sleep(LOOK_S)
+    if not wait_until(lambda: not network.tokens_present(session, keys.conductor), OTHERS_S, LOOK_S):
+        raise RunFailed(
+            f"another run is up at this router, in the realm '{keys.realm}': its robots would take the orders of "
+            "both; wait for its end, or choose another network.realm"
+        )
 
 
 class NetworkView:

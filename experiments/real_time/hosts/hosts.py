@@ -25,7 +25,7 @@ from typing import Final, Self
 import msgspec
 
 from agents import clock
-from agents.clock import STEP_S, Clock
+from agents.clock import STEP_S, Clock, wait_until
 from agents.errors import ExplainedError
 from agents.network import lab, messages
 from agents.network.endpoints import Endpoint
@@ -239,9 +239,7 @@ class Station:
         self.ask(Question("register", lab=None if self.lab is None else self.folder, run=run))
 
     def start(self, name: str, robots: Sequence[str], document: bytes) -> Process:
-        deadline = time.monotonic() + HELLO_S
-        while self._connecting() >= HANDSHAKES and time.monotonic() < deadline:
-            time.sleep(POLL_S)
+        wait_until(lambda: self._connecting() < HANDSHAKES, HELLO_S, POLL_S)
         connect = [part for endpoint in self.endpoints for part in ("--connect", endpoint)]
         connect += [] if self.lab is None else ["--lab", self.folder]
         correction = f"{-self.applied:.6f}"

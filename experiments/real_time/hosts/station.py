@@ -23,7 +23,7 @@ from typing import Final, Literal
 
 import msgspec
 
-from agents.clock import Clock
+from agents.clock import Clock, wait_until
 from agents.errors import ExplainedError
 from agents.network import lab, messages
 from agents.network import session as network
@@ -240,10 +240,8 @@ def serve(fd: int = 0, patience_s: float = LAND_S) -> int:
                 if question.run is not None:
                     until_lost.enter_context(_listed(question.run, question.lab))
                 os.write(1, msgspec.json.encode(answer(question, clock)) + b"\n")
-    lost = time.monotonic()
-    while (left := _other_processes()) and time.monotonic() < lost + patience_s:
-        if time.monotonic() > lost + FROZEN_S and all(_frozen(pid) for pid in left):
-            break  # none of them lands any more
-        time.sleep(POLL_S)
+    soon_s = min(FROZEN_S, patience_s)
+    if not wait_until(lambda: not _other_processes(), soon_s, POLL_S):  # those that are frozen do not land any more
+        wait_until(lambda: all(map(_frozen, _other_processes())), patience_s - soon_s, POLL_S)
     kill(_other_processes())
     return 0

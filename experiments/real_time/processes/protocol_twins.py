@@ -16,6 +16,7 @@ import zenoh
 
 from agents.body.kinds import KINDS
 from agents.clock import Clock, uptime
+from agents.errors import did_you_mean
 from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.endpoints import DEFAULT_ENDPOINT
@@ -75,7 +76,7 @@ def by_hand(
         settings["tables"] = list(tables)
     word = f"{kind}-twin"
     if word not in (known := registry.names(registry.DEVICES)):
-        hint = registry.did_you_mean(kind, [name.removesuffix("-twin") for name in known])
+        hint = did_you_mean(kind, [name.removesuffix("-twin") for name in known])
         raise refusal(f"zenpark twin {kind}", "there is no such protocol twin", hint)
     hover = 0.8 if KINDS[kind].flies else None
     robots = {

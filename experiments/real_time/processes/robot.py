@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import sys
 
+from agents.errors import did_you_mean
+
 if __name__ == "__main__":
     # OpenSSL is 3.5 MB in each robot; without it hashlib has the same functions of its own (numpy.random asks for them)
     sys.modules["_hashlib"] = None  # type: ignore[assignment]
@@ -81,7 +83,7 @@ def fly(launch: RobotLaunch) -> int:
         plan = chosen_case(read, launch.case)
         unknown = [name for name in names if name not in plan.names]
         if unknown:
-            hint = registry.did_you_mean(unknown[0], plan.names)
+            hint = did_you_mean(unknown[0], plan.names)
             raise refusal(file, f"no robot '{unknown[0]}' in this experiment", hint)
         endpoints = router_endpoints(plan, read.path, endpoints, launch.lab) or [DEFAULT_ENDPOINT]
         return _run(plan, launch, endpoints)

@@ -10,9 +10,8 @@ from typing import Final
 import numpy as np
 
 from agents.body.interface import BodyState
-from agents.errors import Refusal
+from agents.errors import Refusal, did_you_mean
 from agents.network import messages
-from agents.plugins import registry
 from agents.vectors import NO_SETPOINT, Setpoint
 from experiments.definition import bodies
 from experiments.definition.experiment import WORLD
@@ -131,7 +130,7 @@ class WorldBodies:
 
     def _row(self, name: str) -> int:
         if name not in self.names:
-            raise Refusal(f"there is no '{name}' in this world; {registry.did_you_mean(name, self.names)}")
+            raise Refusal(f"there is no '{name}' in this world; {did_you_mean(name, self.names)}")
         return self.names.index(name)
 
     def _require_room(self, row: int) -> None:

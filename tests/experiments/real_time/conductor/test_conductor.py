@@ -373,7 +373,7 @@ def test_order_to_stop_waits_for_the_motors(phase, ok, monkeypatch):
 def test_robots_of_another_run_are_not_taken(leaves_at, refused, monkeypatch):
     clock = ManualClock(0.0)
     there = lambda *_: {KEYS.conductor} if clock.now < leaves_at else set()  # noqa: E731
-    monkeypatch.setattr(run_view, "time", clock)
+    monkeypatch.setattr("agents.clock.time", clock)
     monkeypatch.setattr(run_view.network, "tokens_present", there)
     with pytest.raises(RunFailed, match="another run is up at this router") if refused else nullcontext():
         run_view.await_sole_conductor(MagicMock(), KEYS)
