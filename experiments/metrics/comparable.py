@@ -15,7 +15,8 @@ MISSED: Final = 0.01  # share of missed deadlines from which on a run is spoiled
 STALLED: Final = 0.05  # share of those of one robot: among many others a robot that stood still would not show
 LOST: Final = 0.01  # share of lost poses from which on a run is spoiled
 SLOW: Final = 0.9  # real-time factor of a world below which a run is spoiled
-SPOILING: Final = ("began", "could not read", BY_OPERATOR)  # what troubles that spoil a run say
+STOOD: Final = "stood for"  # words of a hold that is too long, and not by an operator
+SPOILING: Final = ("began", "could not read", BY_OPERATOR, STOOD)  # what troubles that spoil a run say
 SAME_LENGTH: Final = 0.005  # share of the longest by which lengths of runs may differ
 SAME_COVERAGE: Final = 0.01  # largest difference of known shares of errors where integrals are compared
 
@@ -35,10 +36,10 @@ def reasons(case: CaseMetrics) -> tuple[str, ...]:
         found.append(f"{', '.join(stalled)} missed {100.0 * STALLED:g} % of its deadlines or more")
     if lost >= LOST:
         found.append(f"{100.0 * lost:.2g} % of the poses were lost")
-    by_operators = [each for each in case.troubles if BY_OPERATOR in each]
-    if any(spoils(each) for each in case.troubles if each not in by_operators):
+    told = [each for each in case.troubles if BY_OPERATOR in each or STOOD in each]
+    if any(spoils(each) for each in case.troubles if each not in told):
         found.append("robots did not begin together, or messages could not be read")
-    found += by_operators
+    found += told
     if factor is not None and factor < SLOW:
         found.append(f"the world ran at {factor:.2f} of real time")
     return tuple(found)

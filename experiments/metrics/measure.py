@@ -8,7 +8,8 @@ of a run that was interrupted cover the time until then.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import msgspec
@@ -20,7 +21,7 @@ from experiments.definition import link_conditions
 from experiments.definition.graph import Links
 from experiments.metrics import centralised
 from experiments.metrics.clearance import collisions
-from experiments.metrics.comparable import reasons
+from experiments.metrics.comparable import STOOD, reasons
 from experiments.metrics.metric import (
     OF_LAW,
     case_values,
@@ -40,7 +41,10 @@ from twins.arrays import norm
 TROUBLES: Final = ("late", "unread")  # kinds of events of the run itself, not of a robot
 PRESENT: Final = 0.8  # least share of known positions of a robot: below it the robot was out of reach
 GAP_S: Final = 0.5  # [s] shorter times without a position are not named
-HELD: Final = 0.2  # share of the time for which an operator may hold a robot
+HELD: Final = 0.2  # share of the time for which a robot may be held
+NAMED_S: Final = 0.05  # [s] shorter holds are not named
+# causes of holds that are not part of an experiment
+HOLDING: Final = (Cause.ORDERED, Cause.POSITION, Cause.ROUTER, Cause.CENTRE, Cause.SUSPENDED)
 CHANGES: Final = {"remove": "removed", "restart": "restarted", "replace": "replaced"}  # orders to the conductor
 LEAVING: Final = "ordered to leave"  # reason of a robot that lands for one of them
 
@@ -111,6 +115,7 @@ def measure(trace: Trace) -> CaseMetrics:
             *(f"{event.source} {event.text}" for event in trace.events if event.kind in TROUBLES),
             *_taken_out(trace).values(),
             *_held(trace),
+            *_restarted(trace),
             *_redirected(trace),
         ),
         failures=failures(trace, shared.known.tolist()),
@@ -222,20 +227,63 @@ def _taken_out(trace: Trace) -> dict[str, str]:
 
 
 def _held(trace: Trace) -> list[str]:
-    """Robots that operators have held for more than a share of the run, one sentence each."""
-    end, held = float(trace.time[-1]), dict.fromkeys(trace.robots, 0.0)
-    since = dict[str, float]()
-    last = [Event(end, "hazard", name, f"{UNRESOLVED}: {Cause.ORDERED.rule.words}") for name in trace.robots]
+    """Robots that operators have held for more than a share of the run, and those that stood for other reasons."""
+    end = float(trace.time[-1])
+    spans: dict[str, list[tuple[float, float, Cause]]] = {name: [] for name in trace.robots}
+    for name, begin, until, cause in _holds(trace):
+        spans[name].append((begin, until, cause))
+    found, groups = list[str](), dict[tuple[str, ...], dict[str, float]]()
+    for name, parts in spans.items():
+        ordered, total = _covered_s([each for each in parts if each[2] is Cause.ORDERED]), _covered_s(parts)
+        words = dict.fromkeys(cause.rule.words for *_, cause in parts if cause is not Cause.ORDERED)
+        if ordered > HELD * end:
+            found.append(f"{name} was held {BY_OPERATOR} for {ordered:.1f} of {end:g} s")
+        elif words and total >= NAMED_S:
+            groups.setdefault((STOOD if total > HELD * end else "held for", *words), {})[name] = total
+    for (what, *causes), totals in groups.items():
+        most = f"{'up to ' * (len(totals) > 1)}{max(totals.values()):.1f} of {end:g} s"
+        found.append(f"{', '.join(totals)} {what} {most}: {', '.join(causes)}")
+    return found
+
+
+def _holds(trace: Trace) -> Iterator[tuple[str, float, float, Cause]]:
+    """Times within the run in which a robot was held: its name, begin and end [s], cause."""
+    end, since = float(trace.time[-1]), dict[tuple[str, Cause], float]()
+    last = [
+        Event(end, "hazard", name, f"{UNRESOLVED}: {cause.rule.words}") for name in trace.robots for cause in HOLDING
+    ]
     for event in (*trace.events, *last):
         outcome, _, words = event.text.partition(": ")
-        if event.kind == "hazard" and event.source in held and words.startswith(Cause.ORDERED.rule.words):
-            at = min(max(event.stamp - (QUIET_S if outcome == OVER else 0.0), 0.0), end)
-            if outcome == "hold":
-                since.setdefault(event.source, at)
-            else:
-                held[event.source] += at - since.pop(event.source, at)
-    long = {name: total for name, total in held.items() if total > HELD * end}
-    return [f"{name} was held {BY_OPERATOR} for {total:.1f} of {end:g} s" for name, total in long.items()]
+        cause = next((each for each in HOLDING if words.startswith(each.rule.words)), None)
+        if event.kind != "hazard" or cause is None or event.source not in trace.robots:
+            continue
+        name, at = event.source, event.stamp - (QUIET_S if outcome == OVER else 0.0)
+        if outcome == "hold":
+            since.setdefault((name, cause), at)
+        elif (begin := since.pop((name, cause), None)) is not None:
+            if lasted := re.search(r" ([\d.]+) s$", words):  # the news of its begin may be late
+                after_s = trace.plan.experiment.safety.neighbour_timeout_s if cause is Cause.ROUTER else 0.0
+                begin = min(begin, at - float(lasted[1]) + after_s)
+            yield name, min(max(begin, 0.0), end), min(max(at, 0.0), end), cause
+
+
+def _covered_s(spans: Iterable[tuple[float, float, Cause]]) -> float:
+    """Length of times that may overlap [s]."""
+    total, until = 0.0, -math.inf
+    for begin, end, _ in sorted(spans):
+        total += max(0.0, end - max(begin, until))
+        until = max(until, end)
+    return total
+
+
+def _restarted(trace: Trace) -> list[str]:
+    """Routers, worlds and the like that ended in the run and were started again, one sentence each."""
+    told = (each for each in trace.events if each.source == "conductor" and each.kind != "recorder")
+    return [
+        f"{event.text.partition('; ')[0]} after {event.stamp:.1f} s, and was started again"
+        for event in told
+        if "; started again" in event.text and 0.0 <= event.stamp <= trace.time[-1]
+    ]
 
 
 def _redirected(trace: Trace) -> list[str]:

@@ -44,7 +44,7 @@ def findings(cases: Sequence[CaseMetrics], notes: Sequence[str] = ()) -> list[Ve
         *interruptions(cases),
         *(VerdictLine("fair", note) for note in notes),
         *criteria_met(cases),
-        *_troubles(cases),
+        *troubles(cases),
         *metric_faults(cases),
         *(line for line in sound if line.mark != "good"),
         *([*_acquired(judged), _worst_link(judged)] if judged else []),
@@ -118,7 +118,7 @@ def spoiled(cases: Sequence[CaseMetrics]) -> Lines:
             yield VerdictLine("bad", f"Spoiled, and compared with nothing: {which}: {why}.")
 
 
-def _troubles(cases: Sequence[CaseMetrics]) -> Lines:
+def troubles(cases: Sequence[CaseMetrics]) -> Lines:
     """Findings of conductor and recorder."""
     for case in cases:
         if case.troubles:

@@ -156,6 +156,7 @@ RUNS: Final = {
     "| 2 | nothing was flown": f"{RUN}[not_ready]",
     "| 3 | the run went to its end": f"{RUN}[held]",
     "| 130 | the user": f"{RUN}[interrupted]",
+    "started again ends with 0": f"{RUN}[router_restarted] {RUN}[centre_restarted] {RUN}[stood]",
     "does not change the exit code": "experiments/metrics/test_criteria.py::test_what_was_not_run_is_not_judged",
     "hangs about 5 s after its last sign": "simulated/test_runs.py::test_recorder_that_hangs_is_replaced",
     "and ends with 1. Report": "experiments/recording/test_bundle.py::test_what_comes_out_otherwise_is_said",

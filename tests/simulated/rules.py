@@ -22,6 +22,8 @@ from agents.body.kinds import Kind
 from agents.decision.lifecycle import AIRBORNE, DONE, LANDING, RUNNING, Phase
 from agents.robot import Robot
 from agents.runtime.loop import Runtime
+from agents.safety.hazards import Outcome
+from experiments.metrics.measure import HOLDING
 from experiments.recording import playback
 from tests.simulated.kernel import BUSY_S, EPOCH, KILLED, Process
 from tests.simulated.world import LOOK_S, OUTSIDE, World
@@ -57,6 +59,12 @@ class Seen:
         return str(self.robot.hazards.worst())
 
     @property
+    def held(self) -> bool:
+        """Whether it stands for a reason that is not part of its experiment; a hold is told for a second longer."""
+        hazards = self.robot.hazards
+        return any(hazards.present >> each & 1 and hazards.level[each] == Outcome.HOLD for each in HOLDING)
+
+    @property
     def governed(self) -> bool:
         """Whether its loop decides for the body: it owns the name, and no watchdog has taken over."""
         return not (self.runtime.keeper.hands_off or self.runtime.watchdog.tripped)
@@ -80,7 +88,7 @@ class Look:
     phases: dict[tuple[int, str], int] = field(default_factory=dict)
     links: dict[tuple[Process | None, bool], bool] = field(default_factory=dict)  # answers of `linked` at this look
     ran_s: dict[str, float] = field(default_factory=dict)  # time in the experiment, by robot
-    held_s: dict[str, float] = field(default_factory=dict)  # time for which an order of an operator held it
+    held_s: dict[str, float] = field(default_factory=dict)  # time for which it stood then
 
     @property
     def now(self) -> float:
@@ -678,8 +686,7 @@ class Rules:
         assert look.world.plan is not None
         if 0.0 <= look.now - start <= look.world.plan.experiment.duration_s and seen.phase == RUNNING:
             look.ran_s[seen.name] = look.ran_s.get(seen.name, 0.0) + LOOK_S
-            ordered = seen.hazard.startswith("hold") and "order" in seen.hazard
-            if ordered and seen.robot.hazards.held:  # a hold that is over is told for a second longer
+            if seen.held:
                 look.held_s[seen.name] = look.held_s.get(seen.name, 0.0) + LOOK_S
 
     def _use(self, rules: list[Rule], name: str, process: Process) -> None:

@@ -13,6 +13,7 @@ LIMIT = '[[criteria]]\nmetric = "f_hz"\nat_most = {}\nwhy = "Few messages are wa
 QUICK = ("rates.body_hz=50",)
 NEVER = 'robots.B.position="external"'
 ABSENT = Fault(0.0, "capture", "B", "gone", since="launch")
+CENTRE, KILLED = ('architecture="centralised"',), Fault(1.0, "kill", "centre")
 GO_ON = (NEVER, 'start.missing="go-on"', "start.deadline_s=2")
 
 
@@ -70,6 +71,11 @@ ROWS = {
     "recorder_cut_off": Run(1, "failed: no begin of a robot", (Fault(-0.3, "cut", "recorder", lasts=20.0),)),
     "disk_full": Run(1, "cannot be written: No space left", (Fault(1.0, "disk", "recorder", "full"),)),
     "stood_still": Run(2, "this process stood still for more than 3 s", frozen("conductor", 5.0)),
+    "router_restarted": Run(
+        0, "the router ended (killed by SIGKILL) after 1.0 s, and was", (Fault(1.0, "kill", "router"),)
+    ),
+    "centre_restarted": Run(0, "A, B held for up to 0.1 of 3 s: it gets no goals; the centre ended", (KILLED,), CENTRE),
+    "stood": Run(3, "A, B stood for up to 1.", (*frozen("conductor", 1.2), KILLED), (*CENTRE, "duration_s=4")),
     "criterion_met": Run(0, "Passed: 1 of 1", experiment=PAIR + LIMIT.format(11)),
     "criterion_not_met": Run(1, "Few messages are wanted.", experiment=PAIR + LIMIT.format(9)),
     "unknown_key": Run(2, "durations", settings=("durations=3",)),

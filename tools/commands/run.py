@@ -406,6 +406,7 @@ def _lines(runs: Sequence[Run], found: dict[str, Any], page: Path | None) -> Ite
     cases = [case for each in runs for case in each.metrics.values()]
     yield from map(str, verdict.spoiled(cases))
     yield from (finding.text for finding in verdict.interruptions(cases))
+    yield from (finding.text for finding in verdict.troubles(cases) if finding.mark == "fair")
     yield from _hazards(runs)
     yield from (_case_line(name, runs, found) for name in found["cases"])
     if any(case.leaders for case in cases):

@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import json
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -169,8 +170,9 @@ def test_what_spoils_a_run(live_trace, columns, event, reason):
 
 
 def held(*ends):
-    words = ("hold: ordered to hold: by an operator", "over: ordered to hold, after 1 s")
-    return [Event(at + k % 2 * QUIET_S, "hazard", "CF01", words[k % 2]) for k, at in enumerate(ends)]
+    begin = "hold: ordered to hold: by an operator"
+    over = [f"over: ordered to hold, after {end - at:.2f} s" for at, end in pairwise(ends)]
+    return [Event(at + k % 2 * QUIET_S, "hazard", "CF01", over[k - 1] if k % 2 else begin) for k, at in enumerate(ends)]
 
 
 def given(*times):
