@@ -388,7 +388,7 @@ def read_back(folder: Path, recordings: Mapping[str, Path], notes: Sequence[str]
                 f"{case}: {played.damaged} bytes of the recording are damaged, and what was in them is missing"
             )
         elif not played.complete:
-            remarks.append(f"{case}: the recording was cut off; `./zenpark recover {file}` mends it")
+            remarks.append(f"{case}: the recording was cut off; `./zenpark export {file}` mends it")
     if len({trace.seed for trace in traces.values()}) > 1:
         seeds = ", ".join(f"{case} {trace.seed}" for case, trace in traces.items())
         remarks.append(f"the recordings are of different seeds: {seeds}")

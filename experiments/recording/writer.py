@@ -388,7 +388,7 @@ class Recording:
         except OSError as error:
             self._over = (
                 f"{self.path}: cannot be written: {error.strerror}; what was recorded so far is kept: "
-                "make room, then run `./zenpark recover` on it"
+                "make room, then `./zenpark export` repairs it"
             )
             raise RecordingError(self._over) from error
         except BaseException:
@@ -397,7 +397,7 @@ class Recording:
 
     @property
     def _interrupted(self) -> str:
-        return f"{self.path}: the recorder was interrupted while it wrote; run `./zenpark recover` on the file"
+        return f"{self.path}: the recorder was interrupted while it wrote; `./zenpark export` repairs the file"
 
 
 @dataclass(frozen=True)

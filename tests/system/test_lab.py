@@ -33,7 +33,7 @@ def test_one_command_runs_while_others_watch_and_stop(tmp_path):
         assert f"  {token}\n" in shown.stdout
     assert "park/CF01/state" in shown.stdout
     assert zenpark("echo", "park/*/pose", "-n", "3", *reach).stdout.count('"robot":') == 3
-    assert "park/CF01/state" in zenpark("hz", "park/*/state", "--seconds", "1", *reach).stdout
+    assert "park/CF01/state" in zenpark("echo", "park/*/state", "--rates", "--seconds", "1", *reach).stdout
     zenpark("echo", "park/*/pose", "--seconds", "0.3", "--connect", endpoint, code=2)
     refused = zenpark("robot", "land", *reach, "--as", "observer", code=None)
     assert refused.stderr.count("no: no answer") == 3

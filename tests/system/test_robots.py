@@ -272,7 +272,7 @@ def test_recording_plays_with_keys_and_payloads_as_flown(router, watcher, tmp_pa
     listening = watcher.session.declare_subscriber(
         "park/**", lambda sample: seen[str(sample.key_expr)].append(sample.payload.to_bytes())
     )
-    zenpark("replay", tmp_path, "--rate", "8", "--connect", router.endpoint)
+    zenpark("view", tmp_path, "--send", "--connect", router.endpoint)
     sent = [messages.decode(each, messages.JSON, messages.Pose) for each in seen["park/CF01/pose"]]
     assert [(p.seq, p.stamp, p.position) for p in sent] == [
         (p.seq, p.stamp, tuple(p.position)) for p in typed(tmp_path / "event.mcap", "/CF01/pose")
@@ -282,7 +282,7 @@ def test_recording_plays_with_keys_and_payloads_as_flown(router, watcher, tmp_pa
         assert len(seen[robot]) == len(typed(tmp_path / "event.mcap", robot.removeprefix("park")))
     seen.clear()
     token = pubsub.alive_token(watcher.session, Keys().conductor)
-    refused = zenpark("replay", tmp_path, "--connect", router.endpoint, code=2)
+    refused = zenpark("view", tmp_path, "--send", "--connect", router.endpoint, code=2)
     assert seen == {}
     assert "a run is up (park/run/conductor)" in refused.stderr
     token.undeclare()

@@ -1,4 +1,4 @@
-"""Commands that say what there is: explain a key, list ready-made experiments and plug-ins, print the schema."""
+"""Commands that say what there is: explain a key, list ready-made experiments and plug-ins."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
-from typer import Argument
+from typer import Argument, Option
 
 from agents.errors import did_you_mean
 from experiments.catalogue import index
@@ -25,6 +25,8 @@ LISTED: Final = 6  # keys about a word that is no key
 @app.command(epilog=example("explain", "explain disturbance.hover_jitter", "explain plan.circle"))
 def explain(
     key: Annotated[str, Argument(help="such as disturbance.hover_jitter, safety, circle; none: all at the top")] = "",
+    *,
+    schema: Annotated[bool, Option("--schema", help="Print the JSON schema of the experiment file instead.")] = False,
     as_json: AsJson = False,
 ) -> int:
     """Explain a key of the experiment file, a plug-in, a kind of robot or a metric: text, unit, limits, an example."""
@@ -33,8 +35,11 @@ def explain(
     from experiments.metrics.metric import known_metrics, short_name
     from experiments.metrics.results import RobotMetrics
 
-    found = reference.matching(key) if key else reference.tables()
     warn(json_schema.unusable())
+    if schema:
+        print_json(json_schema.schema())
+        return 0
+    found = reference.matching(key) if key else reference.tables()
     metric = {short_name(name): each for name, each in known_metrics().items()}.get(short_name(key.lower()))
     if not found and metric is not None:
         print_result(
@@ -138,14 +143,3 @@ def list_(as_json: AsJson = False) -> None:
         *(f"{title}: {', '.join(names) or 'none'}" for title, names in found.items()),
         as_json=as_json,
     )
-
-
-@app.command(epilog=example("schema > zenpark.schema.json"))
-def schema() -> None:
-    """Print the JSON schema of the experiment file."""
-    import json
-
-    from experiments.file import json_schema
-
-    warn(json_schema.unusable())
-    print(json.dumps(json_schema.schema(), indent=2))

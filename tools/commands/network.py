@@ -1,4 +1,4 @@
-"""Commands that look at the network: members and their keys (`keys`), samples (`echo`), their rates (`hz`)."""
+"""Commands that look at the network: members and their keys (`keys`), samples and their rates (`echo`)."""
 
 from __future__ import annotations
 
@@ -130,22 +130,27 @@ def readable(payload: bytes, mime: str) -> str:
         return f"<{len(payload)} bytes, {printable(mime)}>"
 
 
-@app.command(epilog=example("echo 'park/*/pose'", "echo park/world/report -n 1"))
+@app.command(epilog=example("echo 'park/*/pose'", "echo park/world/report -n 1", "echo 'park/*/state' --rates"))
 def echo(
     key: KeyExpression,
     *,
     connect: Connect = None,
     count: Annotated[int | None, Option("--count", "-n", min=1, help="Number of samples after which to end.")] = None,
     seconds: Seconds = None,
+    rates: Annotated[bool, Option("--rates", help="Print rate, bytes and intervals instead.")] = False,
     lab: Lab = None,
     identity: As = "observer",
+    as_json: Annotated[bool, Option("--json", help="Print a line of JSON for each key and second of --rates.")] = False,
 ) -> None:
-    """Print the samples of a key, the last poses first."""
+    """Print the samples of a key, the last poses first; or how often and how regularly they come."""
     import zenoh
 
     expression = key_expression(key)
     deadline = math.inf if seconds is None else time.monotonic() + seconds
     with session("echo", place(connect, lab), identity) as opened:
+        if rates:
+            _print_rates(opened, expression, deadline, as_json=as_json)
+            return
         for sample in islice(_samples(opened, expression, deadline), count):
             deleted = sample.kind == zenoh.SampleKind.DELETE
             text = "(deleted)" if deleted else readable(sample.payload.to_bytes(), str(sample.encoding))
@@ -231,40 +236,28 @@ class Cadence:
         return rates
 
 
-@app.command(epilog=example("hz 'park/*/state' --seconds 5"))
-def hz(
-    key: KeyExpression,
-    *,
-    connect: Connect = None,
-    seconds: Seconds = None,
-    lab: Lab = None,
-    identity: As = "observer",
-    as_json: Annotated[bool, Option("--json", help="Print a line of JSON for each key and second.")] = False,
-) -> None:
-    """Print the rate, bytes and intervals of each key, second by second."""
+def _print_rates(session: zenoh.Session, expression: str, deadline: float, *, as_json: bool) -> None:
+    """Print the rates of all keys, window by window, until `deadline` [monotonic s]."""
     import msgspec
     from zenoh.handlers import Callback
 
-    expression = key_expression(key)
     cadence = Cadence()
     arrived = deque[tuple[str, float, int]](maxlen=DEPTH)
 
     def note(sample: zenoh.Sample) -> None:  # runs in the receiving thread: this process's poll is no arrival
         arrived.append((str(sample.key_expr), time.monotonic(), len(sample.payload)))
 
-    with session("hz", place(connect, lab), identity) as opened:
-        subscriber = opened.declare_subscriber(expression, Callback(note, indirect=False))
-        if not as_json:
-            print(HEADING, flush=True)
-        began = printed = time.monotonic()
-        end = math.inf if seconds is None else began + seconds
-        while printed < end:
-            time.sleep(POLL_S)
-            now = time.monotonic()
-            while arrived:
-                cadence.add(*arrived.popleft())
-            if now - printed >= WINDOW_S or now >= end:
-                for rate in cadence.window(now - printed, now):
-                    print(msgspec.json.encode(rate).decode() if as_json else printable(str(rate)), flush=True)
-                printed = now
-        subscriber.undeclare()
+    subscriber = session.declare_subscriber(expression, Callback(note, indirect=False))
+    if not as_json:
+        print(HEADING, flush=True)
+    printed = time.monotonic()
+    while printed < deadline:
+        time.sleep(POLL_S)
+        now = time.monotonic()
+        while arrived:
+            cadence.add(*arrived.popleft())
+        if now - printed >= WINDOW_S or now >= deadline:
+            for rate in cadence.window(now - printed, now):
+                print(msgspec.json.encode(rate).decode() if as_json else printable(str(rate)), flush=True)
+            printed = now
+    subscriber.undeclare()

@@ -1,4 +1,4 @@
-"""Commands that read results (report, export, recover) and find or remove their folders (runs, clean)."""
+"""Commands that read results (report, export) and find or remove their folders (runs, clean)."""
 
 from __future__ import annotations
 
@@ -229,8 +229,8 @@ def _as_json(run: PastRun) -> dict[str, Any]:
 
 @app.command(epilog=example("export runs/first --csv", "export runs/first supplement.zip --bundle"))
 def export(  # noqa: PLR0917 - a command line
-    folder: Annotated[str, Argument(metavar="RUN", help="Folder of a run.", autocompletion=completion.folders)],
-    target: Annotated[str | None, Argument(metavar="FILE", help="FILE.mat, .csv or .zip. [run.mat in RUN]")] = None,
+    folder: Annotated[str, Argument(metavar="RUN", help="Run, or recording.", autocompletion=completion.folders)],
+    target: Annotated[str | None, Argument(metavar="FILE", help="FILE.mat, .csv, .zip, .mcap. [run.mat]")] = None,
     as_csv: Annotated[bool, Option("--csv", help="A table of trajectories: case, time, robot, x, ...")] = False,
     as_bundle: Annotated[bool, Option("--bundle", help="Archive that repeats the run, for a supplement.")] = False,
     video: Annotated[
@@ -239,13 +239,17 @@ def export(  # noqa: PLR0917 - a command line
     speed: Annotated[float, Option(min=0.1, max=100.0, help="Speed of a film, as a multiple of real time.")] = 4.0,
     as_json: AsJson = False,
 ) -> None:
-    """Write a run for MATLAB, as one table, as a film, or as a bundle that `./zenpark run` repeats."""
+    """Write a run for MATLAB, as one table, a film or a bundle that `run` repeats; a recording: whole, if cut off."""
     from experiments.recording import bundle
     from experiments.report.export import require_savemat, write_csv, write_mat, write_video
     from experiments.run import reopen
 
     if video is not None and (target or as_csv or as_bundle or video.suffix.lower() not in (".mp4", ".gif")):
         raise ExplainedError(f"{video}: name the film behind --video alone, with .mp4 or .gif at its end")
+    if folder.endswith(".mcap"):
+        source = Path(folder)
+        _repair(source, Path(target or source.with_name(f"{source.stem}-recovered.mcap")), as_json=as_json)
+        return
     own = video.suffix if video else ".csv" if as_csv else ".zip" if as_bundle else ".mat"
     place = Path(folder).resolve()
     usual = place.with_name(f"{place.name}.zip") if as_bundle else place / f"run{own}"
@@ -270,21 +274,13 @@ def export(  # noqa: PLR0917 - a command line
     print_result(shown, f"{file}: {', '.join(found.traces)}", as_json=as_json)
 
 
-@app.command(epilog=example("recover runs/first/event.mcap"))
-def recover(
-    file: Annotated[str, Argument(metavar="FILE", help="A recording that was cut off.")],
-    target: Annotated[str | None, Argument(metavar="TARGET", help="Path of the repaired recording.")] = None,
-    as_json: AsJson = False,
-) -> None:
-    """Repair a recording after its writer was killed."""
-    from experiments.recording.reader import later_parts
-    from experiments.recording.reader import recover as repair
+def _repair(source: Path, target: Path, *, as_json: bool) -> None:
+    """Write what a recorder that was killed has left as a whole recording."""
+    from experiments.recording.reader import later_parts, recover
 
-    source = Path(file)
-    chosen = Path(target) if target else source.with_name(f"{source.stem}-recovered.mcap")
-    found = repair(source, chosen, later_parts(source))
-    made = f"{source} is whole already" if found.complete else str(chosen)
-    shown = {"file": source if found.complete else chosen, "was_whole": found.complete}
+    found = recover(source, target, later_parts(source))
+    made = f"{source} is whole already" if found.complete else str(target)
+    shown = {"file": source if found.complete else target, "was_whole": found.complete}
     lost = f"; {found.damaged} bytes were damaged, and what was in them is missing" if found.damaged else ""
     print_result(
         shown | {"messages": found.messages, "robots": found.robots, "damaged_bytes": found.damaged},

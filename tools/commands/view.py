@@ -1,4 +1,4 @@
-"""`./zenpark view`: a run in the browser, live or from its recording. `top`: its table. `replay`: its recording."""
+"""`./zenpark view`: a run in the browser, live or from its recording. `top`: its table."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from tools import completion
 from tools.options import (
     As,
     AsJson,
-    Case,
     Connect,
     Lab,
     Realm,
@@ -37,9 +36,9 @@ if TYPE_CHECKING:
     from experiments.real_time.hosts.run_registry import RegisteredRun
     from experiments.run import Watch
     from experiments.view.acting import WatchedRun
-    from experiments.view.replay import ReplayClock
     from experiments.view.serving import PageServer
     from tools.live_table import LiveRow
+    from tools.options import Place
 
 app: Final = typer.Typer()
 
@@ -51,15 +50,17 @@ REFRESH_S: Final = 0.25  # period of the table
 FIRST_S: Final = 5.0  # limit for the reports of a table that is printed once
 
 
-@app.command(epilog=example("view", "view runs/first --open"))
+@app.command(epilog=example("view", "view runs/first --open", "view runs/first/event.mcap --send --loop"))
 def view(
     run: Annotated[
         str | None,
         Argument(metavar="[RUN]", help="Folder of a run. [that which is up here]", autocompletion=completion.folders),
     ] = None,
     *,
+    send: Annotated[bool, Option("--send", help="Play the recording onto the network instead.")] = False,
+    loop: Annotated[bool, Option("--loop", help="With --send: restart at the end.")] = False,
     connect: Connect = None,
-    realm: Realm = "park",
+    realm: RealmOfRun = None,
     lab: Lab = None,
     identity: Annotated[
         str | None,
@@ -71,11 +72,17 @@ def view(
     with_run: Annotated[bool, Option("--with-run", hidden=True, help="Wait for the run, and end with it.")] = False,
 ) -> int:
     """Show a run in the browser, in three dimensions: a live one, or a recording."""
-    require_viser()
     from agents.runtime.command_line import on_termination
     from experiments.recording.reader import RecordingError
 
     ended = threading.Event()
+    if send:
+        if run is None:
+            raise typer.BadParameter("name the run that is sent", param_hint="--send")
+        with on_termination(ended.set):
+            who = identity or "operator"
+            return _send(_recordings(Path(run))[0], place(connect, lab, acting=True), realm, who, ended, loop=loop)
+    require_viser()
     with on_termination(ended.set):
         up = None if run is None else _running_run(Path(run), wait_s=START_S if with_run else 0.0, ended=ended)
         if run is not None and up is None:
@@ -85,7 +92,7 @@ def view(
                 up = _starting_run(Path(run), ended)
                 if up is None:
                     raise
-        watched = _watched(connect, realm, lab, identity) if up is None else _of_run(up, identity)
+        watched = _watched(connect, realm or "park", lab, identity) if up is None else _of_run(up, identity)
         _live(watched, ended, port=port, dark=dark, open_page=open_page, with_run=with_run)
     return 0
 
@@ -192,49 +199,25 @@ class _Top:
         return drawn(title, rows, [each for each in self._observer.events if each.kind != "robot"], width, height)
 
 
-@app.command(epilog=example("replay runs/first", "replay runs/first --case event --rate 5 --loop"))
-def replay(
-    run: Annotated[str, Argument(metavar="RUN", help="Folder of a run, or a recording (.mcap).")],
-    *,
-    case: Case = None,
-    rate: Annotated[float, Option(min=0.01, max=100.0, help="Speed, as a multiple of real time.")] = 1.0,
-    loop: Annotated[bool, Option("--loop", help="Restart at the end.")] = False,
-    connect: Connect = None,
-    realm: RealmOfRun = None,
-    lab: Lab = None,
-    identity: As = "operator",
-) -> None:
-    """Play a recording onto the network, for view, top, echo and other tools; in a terminal Enter pauses it."""
+def _send(file: Path, where: Place, realm: str | None, identity: str, ended: threading.Event, *, loop: bool) -> int:
+    """Play a recording onto the network; return the exit code."""
     from agents.network.session import open_session
     from agents.network.shutdown import closing_cleanly
-    from agents.runtime.command_line import on_termination
     from experiments.view.broadcast import Broadcast
     from experiments.view.replay import ReplayClock
 
-    file = _recordings(Path(run), case)[0]
-    ended = threading.Event()
-    with on_termination(ended.set):
-        endpoints = place(connect, lab, acting=True).endpoints
-        opened = open_session(endpoints, name="replay", wait_s=5.0, identity=identity)
-        with closing_cleanly(opened) as (session, declared):
-            played = Broadcast(session, file, realm)
-            declared.append(played)
-            clock = ReplayClock(0.0, played.end - played.begin)
-            clock.playing = True
-            clock.speed, clock.loop = rate, loop
-            if sys.stdin.isatty():
-                threading.Thread(target=_pause_on_enter, args=(clock,), daemon=True).start()
-            print(f"{file}: {clock.end:.1f} s, in the realm {played.keys.realm}", flush=True)
-            print(f"messages sent: {played.run(ended, clock, endpoints)}")
+    opened = open_session(where.endpoints, name="replay", wait_s=5.0, identity=identity)
+    with closing_cleanly(opened) as (session, declared):
+        played = Broadcast(session, file, realm)
+        declared.append(played)
+        clock = ReplayClock(0.0, played.end - played.begin)
+        clock.playing, clock.loop = True, loop
+        print(f"{file}: {clock.end:.1f} s, in the realm {played.keys.realm}", flush=True)
+        print(f"messages sent: {played.run(ended, clock, where.endpoints)}")
+    return 0
 
 
-def _pause_on_enter(clock: ReplayClock) -> None:
-    for _ in sys.stdin:
-        clock.playing = not clock.playing
-        print("plays" if clock.playing else f"paused at {clock.t:.1f} s", flush=True)
-
-
-def _recordings(folder: Path, case: str | None = None) -> list[Path]:
+def _recordings(folder: Path) -> list[Path]:
     """Recordings of a run, the oldest first."""
     from experiments.recording.reader import RecordingError
 
@@ -243,10 +226,7 @@ def _recordings(folder: Path, case: str | None = None) -> list[Path]:
     files = sorted(folder.glob("*.mcap"), key=lambda file: file.stat().st_mtime_ns)
     if not files:
         raise RecordingError(f"{folder}: holds no recording (.mcap); name the folder of a run")
-    found = [file for file in files if case in (None, file.stem)]
-    if not found:
-        raise RecordingError(f"{folder}: no case '{case}'; there are: {', '.join(file.stem for file in files)}")
-    return found
+    return files
 
 
 def require_viser() -> None:

@@ -120,7 +120,7 @@ assert {{each for each in sys.modules if each.startswith("experiments")}} == {{"
 def test_kind_of_the_docs_is_known_everywhere(shelled, tmp_path):
     assert re.search(r"Kinds of robots: .*\bhovercraft\b", shelled("list").stdout)
     assert "0.8 kg" in shelled("explain", "hovercraft").stdout
-    assert '"hovercraft"' in shelled("schema").stdout
+    assert '"hovercraft"' in shelled("explain", "--schema").stdout
     words = ["triangle", "--set", "robots.KH01.kind=hovercraft", "--set", "duration_s=4"]
     assert shelled("check", *words).returncode == 0
     refused = shelled("check", *words, "--set", "world.engine=pymunk")

@@ -104,7 +104,9 @@ def broken(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "words", [["explain", "formation.law"], ["schema"], ["new", "triangle", "mine.toml"]], ids=lambda words: words[0]
+    "words",
+    [["explain", "formation.law"], ["explain", "--schema"], ["new", "triangle", "mine.toml"]],
+    ids=lambda words: words[0],
 )
 def test_broken_plugin_stops_no_command_that_needs_none(broken, words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -115,7 +115,7 @@ def test_a_full_disk_keeps_what_was_written(path):
     messages = rec.scattered(2000)
     made = rec.recording(path)
     with rec.small_disk():
-        with pytest.raises(RecordingError, match=r"run\.mcap: cannot be written: .*zenpark recover"):
+        with pytest.raises(RecordingError, match=r"run\.mcap: cannot be written: .*zenpark export`"):
             rec.put(made, [rec.begun(), *messages])
         with pytest.raises(RecordingError, match="make room"):
             made.write(messages[0])
@@ -144,7 +144,7 @@ def test_interrupt_inside_a_write_ends_all_writing(path, monkeypatch):
     monkeypatch.setattr(writer.McapFile, "flush", Mock(side_effect=KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         made.flush()
-    with pytest.raises(RecordingError, match=r"interrupted while it wrote; run `\./zenpark recover`"):
+    with pytest.raises(RecordingError, match=r"interrupted while it wrote; `\./zenpark export`"):
         made.write(rec.begun())
     made.close()
 
@@ -253,7 +253,7 @@ def assert_same(trace, wanted, robots=None):
 def test_a_whole_file_needs_no_recovery(path, tmp_path, capsys):
     rec.write(path, *rec.whole_run())
     assert recover(path, tmp_path / "whole.mcap") == Recovered(82, ("TB01", "CF01"), complete=True)
-    commands.recover(str(path), None)
+    commands.export(str(path))
     assert capsys.readouterr().out == f"{path} is whole already: 82 messages of TB01, CF01\n"
     assert sorted(tmp_path.iterdir()) == [path]
 
@@ -269,7 +269,7 @@ def test_a_recorder_that_took_over_completes_the_recording(path, tmp_path, capsy
     later.parent.mkdir(parents=True)
     rec.write(later, *events, poses[-1], *rest)
     (later.parent / "part3.mcap").touch()  # killed before its first record
-    commands.recover(str(path), None)
+    commands.export(str(path))
     rec.write(whole := tmp_path / "whole.mcap", *run)
     target = path.with_name("run-recovered.mcap")
     made, wanted = read(target), read(whole)
@@ -429,7 +429,7 @@ def test_zeros_over_a_border_cost_one_chunk(path, tmp_path, capsys, chunk, finis
     playback = read(path)
     assert whole - 400 < playback.messages < whole
     assert (playback.complete, 512 < playback.damaged < 40_000) == (False, True)
-    commands.recover(str(path), None)
+    commands.export(str(path))
     counted = f"{playback.messages} messages of TB01; {playback.damaged} bytes were damaged"
     assert counted in capsys.readouterr().out
     assert read(path.with_name("run-recovered.mcap")).messages == playback.messages

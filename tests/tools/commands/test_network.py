@@ -144,11 +144,11 @@ def test_ctrl_c_ends_echo_quietly(router, pose):
 
 
 @pytest.mark.system
-def test_hz_measures_a_live_publisher(router, robot, capsys):
+def test_rates_of_a_live_publisher(router, robot, capsys):
     echo("park/**", connect=[router.endpoint], seconds=0.1)
     assert capsys.readouterr().out == ""
     state = publisher(robot, "park/CF01/state", JSON)
-    with started(*GUARD, "hz", "park/**", "--connect", router.endpoint, "--seconds", "1.5") as measuring:
+    with started(*GUARD, "echo", "park/**", "--rates", "--connect", router.endpoint, "--seconds", "1.5") as measuring:
         assert measuring.stdout.readline() == HEADING + "\n"
         while measuring.poll() is None:
             state.put(b"x" * 100)
