@@ -10,8 +10,11 @@ from hypothesis import settings
 
 
 def examples(count: int) -> settings:
-    """Settings of a test with this many random examples; --quick has fewer."""
-    return settings() if settings.get_current_profile_name() == "quick" else settings(max_examples=count)
+    """Settings of a test with this many random examples in `./zenpark test --all`; else a third, with --quick five."""
+    profile = settings.get_current_profile_name()
+    return (
+        settings() if profile == "quick" else settings(max_examples=count if profile == "all" else max(10, count // 3))
+    )
 
 
 def mostly_slow(cases: Iterable[object], every: int) -> list[object]:
@@ -20,6 +23,11 @@ def mostly_slow(cases: Iterable[object], every: int) -> list[object]:
         case if k % every == 0 else pytest.param(*(case if isinstance(case, tuple) else [case]), marks=pytest.mark.slow)
         for k, case in enumerate(cases)
     ]
+
+
+def nightly(*values: object) -> object:
+    """A row of `pytest.mark.parametrize` that runs with --all alone."""
+    return pytest.param(*values, marks=pytest.mark.nightly)
 
 
 def for_each(names: str, cases: Iterable[object]) -> Callable[[Callable[..., None]], Callable[..., None]]:

@@ -24,8 +24,8 @@ from hypothesis import settings as hypothesis_settings
 from agents.network.endpoints import free_endpoint
 from tests.waiting import until
 
-hypothesis_settings.register_profile("zenpark", deadline=None)  # no test depends on how fast this machine is
-hypothesis_settings.register_profile("quick", deadline=None, max_examples=5)  # `./zenpark test --quick`
+for name, most in (("zenpark", 35), ("quick", 5), ("all", 100)):  # profiles of `./zenpark test` and its options
+    hypothesis_settings.register_profile(name, deadline=None, max_examples=most)  # the machine may be slow
 hypothesis_settings.load_profile("zenpark")
 # no test may find the runs of whoever uses this machine, least of all to stop them, or the verdicts of former checks
 os.environ["ZENPARK_RUNTIME_DIR"] = tempfile.mkdtemp(prefix="zenpark-tests-")

@@ -87,6 +87,9 @@ def test_texts_are_plain(place):
 
 
 def trailing_comments(file: Path) -> Iterator[tuple[int, str]]:
+    """Line and text of comments behind code, of a file in which a comment may be wrong."""
+    if not DEPENDENT.search(file.read_text("utf-8")):
+        return
     with file.open("rb") as source:
         for token in tokenize.tokenize(source.readline):
             if token.type == tokenize.COMMENT and token.line[: token.start[1]].strip():

@@ -2,6 +2,7 @@
 
 import random
 from functools import partial
+from itertools import cycle, product
 from math import dist, inf, isfinite, isnan, nan
 
 import pytest
@@ -19,8 +20,10 @@ from experiments.definition.experiment import Formation, RobotTable
 from experiments.definition.plan import Plan
 from experiments.file.document import load
 from tests.agents.bench import Swarm, drone
-from tests.cases import mostly_slow
+from tests.cases import mostly_slow, nightly
 from tests.small import pair, small
+
+SLOW = partial(pytest.param, marks=pytest.mark.slow)
 
 STILL = (0.0, 0.0, 0.0, 0.0)
 
@@ -266,7 +269,7 @@ def trouble(rng, swarm, name):
     ])  # fmt: skip
 
 
-@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 12))])
+@pytest.mark.parametrize("seed", [0, 1, *map(SLOW, range(2, 5)), *map(nightly, range(5, 12))])
 def test_whatever_happens_no_robot_comes_up_again(seed):
     robots = {
         name: RobotTable(kind=kind, start=start, hover=hover)
@@ -294,7 +297,6 @@ def test_whatever_happens_no_robot_comes_up_again(seed):
 
 
 ODD = (nan, inf, -inf, 0.0, -0.0, 1e308, -1e308, 1e-308, 5e-324, 1e154, -1e154, 1e6, -1e6)
-SLOW = partial(pytest.param, marks=pytest.mark.slow)
 
 
 class Nonsense:
@@ -356,8 +358,17 @@ def keeps_limits(robot: Robot) -> bool:
     return fits and all(map(isfinite, setpoint))
 
 
-@pytest.mark.parametrize("name", ["robotic-park", *map(SLOW, ["obstacle-course", "convoy", "architectures"])])
-@pytest.mark.parametrize("trigger", mostly_slow(registry.names(registry.TRIGGERS), 3))
+OTHERS, CHOICE = ("obstacle-course", "convoy", "architectures"), registry.names(registry.TRIGGERS)
+DAILY = [*zip(cycle(OTHERS), CHOICE, strict=False)]
+
+
+@pytest.mark.parametrize(
+    ("name", "trigger"),
+    [
+        *mostly_slow(product(["robotic-park"], CHOICE), 3),
+        *(SLOW(*row) if row in DAILY else nightly(*row) for row in product(OTHERS, CHOICE)),
+    ],
+)
 def test_nonsense_raises_nothing(name, trigger):
     for number, given in enumerate(load(name).cases().values()):
         plan = given.changed(trigger={"kind": trigger})

@@ -81,7 +81,7 @@ def test_guides_import_from_nowhere_else(place):
         assert not elsewhere, "import it from zenpark (experiments/api.py, docs/python.md)"
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_type_checkers_know_the_names(tmp_path):
     """In a folder of the user's own, by what is installed."""
     laws = [block for block in BLOCK.findall(PAGE) if "Clock(Law" in block or "Rope(Gradient" in block]

@@ -49,7 +49,7 @@ ALONE = small(
     [
         (short(PERIODIC), 1),
         (short(PERIODIC, duration_s=4.0, formation=changed(PERIODIC.formation, update="relative-control")), 2),
-        (short(PERIODIC, duration_s=2.0, timeline=[], avoidance={"kind": "barrier"}), 1),
+        (short(PERIODIC, duration_s=2.0, timeline=[], avoidance={"kind": "potential"}), 1),
         (ALONE, 1),
         pytest.param(PERIODIC, 1, marks=pytest.mark.nightly),
     ],

@@ -1,6 +1,10 @@
-"""Traces for tests: motions with known integrals, and a small simulated formation for figures and reports."""
+"""Traces for tests: motions with known integrals, and a small simulated formation for figures and reports.
+
+A formation is computed once in a process of tests; nobody writes to what they share.
+"""
 
 import dataclasses
+from functools import cache
 
 import numpy as np
 
@@ -89,6 +93,7 @@ def pair(distance, *, legs=(), target=1.0, **rest):
     return trace(what, position, **rest)
 
 
+@cache
 def park(case="periodic", threshold=0.0, *, seed=1, duration=45.0):
     """The reference formation with first-order robots; send-on-delta if there is a threshold [m]."""
     robots = reference("periodic").robots
@@ -98,6 +103,7 @@ def park(case="periodic", threshold=0.0, *, seed=1, duration=45.0):
     return simulate(what, start, case, threshold, seed=seed, duration=duration)
 
 
+@cache
 def crowd(rows, case="periodic", threshold=0.0, *, seed=1, duration=20.0):
     """Any number of robots on a hemisphere, each linked to its nearest ones, starting off their places."""
     rng = np.random.default_rng(rows)

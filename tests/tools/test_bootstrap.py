@@ -221,14 +221,16 @@ def started_modules(bootstrap, monkeypatch):
     """The modules that `./zenpark test` starts; those of tests fail."""
     modules = []
     monkeypatch.setattr(bootstrap, "add_needed", lambda: None)
-    monkeypatch.setattr(bootstrap, "python", lambda module: modules.append(module) or int(module[0] == "pytest"))
+    monkeypatch.setattr(bootstrap, "python", lambda module: modules.append(module) or -9 * (module[0] == "pytest"))
     return modules
 
 
 def test_tests_run_in_three_parts_or_as_given(bootstrap, started_modules):
-    def started(*words):
+    """A part that a signal ends has failed."""
+
+    def started(*words, code=9):
         started_modules.clear()
-        assert bootstrap.test([*words]) == 1
+        assert bootstrap.test([*words]) == code
         assert [module[0] for module in started_modules[:3]] == ["ruff", "ruff", "mypy"]
         return started_modules[3:]
 
@@ -237,6 +239,6 @@ def test_tests_run_in_three_parts_or_as_given(bootstrap, started_modules):
     for part, workers, whole_runs in ((devices, "2", False), (runs, "1", True)):
         assert part[2:5] == ["mechanism", "-n", workers]
         assert {file.startswith("tests/system/") for file in part if file.startswith("tests/")} == {whole_runs}
-    assert started("--quick", "tests/agents", "-x") == [["pytest", "-m", bootstrap.QUICK, "tests/agents", "-x"]]
+    assert started("--quick", "tests/agents", "-x", code=-9) == [["pytest", "-m", bootstrap.QUICK, "tests/agents", "-x"]]
     modules = [module[0] for module in started("--all")]
     assert modules == ["pytest", "tests.fuzz", "tests.system.zenohd", "tests.system.rclpy_wheels", "pytest"]

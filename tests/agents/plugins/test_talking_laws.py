@@ -143,7 +143,7 @@ def no_task_twice(taken, tasks):
 @pytest.mark.parametrize("loss", [0.0, 0.3])
 def test_auction_total_is_within_bound_of_optimum(loss):
     gaps = []
-    for seed in range(100):
+    for seed in range(40):
         places, tasks, pairs = drawn(seed)
         law = Auction(tasks=tasks, epsilon=EPSILON, calm_s=1e9)
         talking = Talking(law, places, pairs, loss=loss, seed=seed)
@@ -160,7 +160,7 @@ def test_auction_total_is_within_bound_of_optimum(loss):
 
 @pytest.mark.slow
 def test_robots_that_begin_anew_take_no_task_twice():
-    for seed in range(40):
+    for seed in range(20):
         (places, tasks, pairs), random = drawn(seed), Random(seed)
         law = Auction(tasks=tasks, epsilon=EPSILON, calm_s=1e9)
         talking = Talking(law, places, pairs, loss=0.3, seed=seed)
@@ -173,7 +173,7 @@ def test_robots_that_begin_anew_take_no_task_twice():
         assert no_task_twice(won(talking), tasks)
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("unflown")
 def test_rounds_are_foretold_and_small_bids_found():
     ((severity, message, _),) = law_findings("auction")
     assert severity == "note"

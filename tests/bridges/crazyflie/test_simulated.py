@@ -9,6 +9,7 @@ import random
 import struct
 import threading
 from collections import deque
+from itertools import product
 
 import numpy as np
 import pytest
@@ -33,6 +34,7 @@ from bridges.crazyflie.twin.supervisor import SupervisorState
 from bridges.crazyflie.twin.tables import LOG_CODES, PACKINGS
 from experiments.real_time.conductor.hot_changes import CLIMB_S
 from tests.bridges.crazyflie.flights import clocked
+from tests.cases import nightly
 from tests.requests import request
 from tests.waiting import ManualClock
 from twins.device import DeviceRequest, Faults
@@ -319,10 +321,6 @@ def circling(fleet):
     return fleet.run(1.0, speed=0.3)
 
 
-def nightly(*values):
-    return pytest.param(*values, marks=pytest.mark.nightly)
-
-
 @pytest.mark.parametrize(
     ("rows", "exchanges", "rates", "yaw"),
     [
@@ -473,7 +471,15 @@ def test_short_gaps_one_after_the_other(circling):
     assert circling.phases == {FlightPhase.FLYING}
 
 
-@pytest.fixture(params=[(0.8, -4.0), nightly((0.8, 4.0)), nightly((1.5, -4.0)), (1.5, 4.0)], ids=str)
+def with_errors(name, one, other):
+    """A value of each kind with one height [m] and wrong accelerometer [mg]; all pairs of them nightly."""
+    daily = ((0.8, -4.0), one), ((1.5, 4.0), other)
+    rest = [(error, value) for error in product((0.8, 1.5), (-4.0, 4.0)) for value in (one, other)]
+    rows = [*daily, *(nightly(*row) for row in rest if row not in daily)]
+    return pytest.mark.parametrize(("measured", name), rows, indirect=["measured"])
+
+
+@pytest.fixture
 def measured(request, monkeypatch):
     """On its way up to a height [m] by positions from outside, with an accelerometer that is wrong [mg]."""
     height, error = request.param
@@ -497,7 +503,7 @@ def came_down(fleet, seconds):
     return (cut < 0.3, fleet.touch < 1.3, max(heights[down:], default=math.inf) < 0.02) == (True, True, True)
 
 
-@pytest.mark.parametrize("climbs", [False, True])
+@with_errors("climbs", False, True)
 def test_blind_drone_without_radio_stops_its_motors(measured, climbs):
     """Its accelerometer would lift it again from the floor; locked, it does not."""
     if not climbs:
@@ -509,7 +515,7 @@ def test_blind_drone_without_radio_stops_its_motors(measured, climbs):
     assert measured.troubles == {"out of reach: approach it only when its motors stand"}
 
 
-@pytest.mark.parametrize("in_landing", [False, True])
+@with_errors("in_landing", False, True)
 def test_blind_landing_ends_on_the_floor(measured, in_landing):
     hover(measured)
     if in_landing:
@@ -524,7 +530,7 @@ def test_blind_landing_ends_on_the_floor(measured, in_landing):
     assert measured.supervised != SupervisorState.LOCKED
 
 
-@pytest.mark.parametrize("gap", [1.5, math.inf])
+@with_errors("gap", 1.5, math.inf)
 def test_measured_landing_is_led_down(measured, gap):
     """Softly; where the radio is lost on the way the descent on board goes on."""
     hover(measured)

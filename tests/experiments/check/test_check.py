@@ -238,7 +238,7 @@ def test_command_prints_a_table_or_json():
         'formation.links."KH01 - KH03"=1e200',
         "formation.gain=1e300",
         "timeline.0.plan.speed=1e300",
-        "safety.speed=1e-9",
+        pytest.param("safety.speed=1e-9", marks=pytest.mark.nightly),
         "arena.size=[1e300,1e300,1e300]",
         pytest.param("rates.coordination_hz=0.01", marks=pytest.mark.nightly),
     ],

@@ -13,6 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from experiments.definition.experiment import Arena
 from experiments.metrics.measure import measure
 from experiments.report import figures, replay, style, trajectories
+from tests.cases import nightly
 from tests.experiments.traces import crowd, cut, pair, park
 from tests.runs import flown
 from tests.system.browser import CHROMIUM, needs_chromium
@@ -200,7 +201,7 @@ def test_short_and_unknown_cases_are_drawn():
     assert figures.all_figures([], []) == figures.all_figures([], [cut(park(), -1.0)]) == {}
 
 
-@pytest.mark.parametrize("rows", [np.s_[300:], np.s_[:1100], np.s_[50:, 6], np.s_[:, 5]])
+@pytest.mark.parametrize("rows", [np.s_[300:], nightly(np.s_[:1100]), nightly(np.s_[50:, 6]), np.s_[:, 5]])
 def test_whatever_is_unknown_can_be_drawn(rows):
     known = park(duration=23.0)
     silent = dataclasses.replace(known, sent=known.sent.take(np.arange(0)))

@@ -92,8 +92,8 @@ def test_report_of_a_run_stands_alone(tmp_path, two_cases):
 
     (tmp_path / "run.json").write_bytes(msgspec.json.encode(RunOrigin("zenpark run <this> --seed 1", "2030-01-02")))
     html = write().read_text("utf-8")
-    page = checked_page(write())
-    assert write().read_text("utf-8") == html
+    page = checked_page(again := write())
+    assert again.read_text("utf-8") == html
     assert page.ids.count("f1-figure_1") == page.ids.count("f7-figure_1") == 1
     for words in (
         "Nobody, Nowhere 2020", "2030-01-02", "It rained.", "zenpark run <this> --seed 1", "No pose was lost: 17\u202f",

@@ -27,12 +27,13 @@ from tests.runs import flown, fly
 NIGHTLY = pytest.mark.nightly
 CENTRALISED = "architecture=centralised"
 HYBRID = 'architecture={ kind = "hybrid", robots = ["CF01", "CF03"] }'
-MARKS = {"periodic": pytest.mark.slow, "event": NIGHTLY, "event-loss": pytest.mark.slow}
-every_case = pytest.mark.parametrize("case", [pytest.param(case, marks=mark) for case, mark in MARKS.items()])
+MARKS = {"periodic": pytest.mark.slow, "event": NIGHTLY, "event-loss": NIGHTLY}
+LOSSY = {"periodic": NIGHTLY, "event": NIGHTLY, "event-loss": pytest.mark.slow}
+every_case = pytest.mark.parametrize("case", [pytest.param(case, marks=mark) for case, mark in LOSSY.items()])
 
 
 def limits(*given):
-    """Table of the cases with a limit each."""
+    """Table of the cases with a limit each; the tightest one is that of the periodic case."""
     rows = [pytest.param(case, most, marks=MARKS[case]) for case, most in zip(MARKS, given, strict=True)]
     return pytest.mark.parametrize(("case", "most"), rows)
 

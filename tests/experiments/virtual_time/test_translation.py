@@ -15,18 +15,20 @@ from enum import IntEnum
 from functools import partial
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from experiments.virtual_time import machine, translation
 from experiments.virtual_time.records import Image, Layouts
 from experiments.virtual_time.translation import LARGEST, WHOLE, OutsideError, Program
+from tests.cases import examples
 from tests.commands import ROOT
 from tests.experiments.virtual_time.constructs import CONSTRUCTS, ROWS, Case
 
 ERRORS = ArithmeticError, ValueError, IndexError, AssertionError
 CC = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler here")
-COMPILERS = [pytest.param(False, id="libtcc"), pytest.param(True, id="cc", marks=CC)]
+# programs of all constructs are compiled by cc every day
+COMPILERS = [pytest.param(False, id="libtcc"), pytest.param(True, id="cc", marks=[CC, pytest.mark.nightly])]
 ODD = (math.nan, math.inf, -math.inf, -0.0, 0.0, 1e308, -1e308, 5e-324, 0.5, 1.5, 2.5, -0.5, 1.0, -1.0, 2.0**53, -3.0)
 
 
@@ -228,7 +230,7 @@ def hold_to_python(program, *, often):
 SEEDS = st.integers(0, 2**32)
 
 
-@settings(deadline=None, max_examples=100)
+@examples(100)
 @given(SEEDS)
 def test_any_program_is_that_of_python(seed):
     hold_to_python(Writer(seed).program(), often=False)
@@ -236,7 +238,7 @@ def test_any_program_is_that_of_python(seed):
 
 @CC
 @pytest.mark.slow
-@settings(deadline=None, max_examples=30)
+@examples(30)
 @given(SEEDS)
 def test_any_program_is_that_of_python_by_cc(seed):
     hold_to_python(Writer(seed).program(), often=True)
