@@ -50,7 +50,8 @@ GRAPHS: dict[str, Pairs] = {
 
 def laplacian_of(pairs: Pairs) -> Array:
     """L = D − A of the graph in which both ends of every pair receive from each other."""
-    return graph.laplacian(graph.links([*pairs, *((j, i) for i, j in pairs)]), N)
+    net = graph.links([*pairs, *((j, i) for i, j in pairs)])
+    return graph.degree(net, N) - graph.adjacency(net, N)
 
 
 print(laplacian_of(GRAPHS["path"]))

@@ -35,7 +35,7 @@ def links(
 ) -> Links:
     """Links by distance from (receiver, sender) pairs in any order; one number is for all of them.
 
-    Pairs are enough where only the matrices are wanted: `laplacian(links(pairs), rows)`.
+    Pairs are enough where only the matrices are wanted: `adjacency(links(pairs), rows)`.
     """
     both = np.array(pairs, dtype=np.intp).reshape(-1, 2)
     order = np.lexsort((both[:, 1], both[:, 0]))
@@ -53,11 +53,6 @@ def adjacency(net: Links, rows: int) -> Array:
 def degree(net: Links, rows: int) -> Array:
     """D (N, N): number of neighbours that each robot receives from, on the diagonal."""
     return np.diag(adjacency(net, rows).sum(axis=1))
-
-
-def laplacian(net: Links, rows: int) -> Array:
-    """L = D − A (N, N) (paper, eq. (5))."""
-    return degree(net, rows) - adjacency(net, rows)
 
 
 def edges(net: Links) -> Index:

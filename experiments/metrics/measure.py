@@ -58,7 +58,7 @@ def measure(trace: Trace) -> CaseMetrics:
         raise ValueError(f"case '{trace.case}' holds fewer than two samples: the run ended before it began")
     asked, missing = metrics_of_criteria(trace.plan.experiment.criteria)
     metrics, left_out = known_metrics() | asked | law_metrics(measures_of(trace)), unusable_metrics()
-    shared = Measurement(trace)
+    shared = Measurement.of(trace)
     values, faults = values_of(metrics, shared)
     mean = case_values(metrics, values, shared.kept)
     names, errors, belief = trace.robots, shared.errors, shared.belief

@@ -11,6 +11,7 @@ from functools import cached_property, wraps
 from itertools import pairwise
 from math import inf, nan
 from typing import Any, Final, NamedTuple, TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from msgspec import structs
@@ -152,6 +153,11 @@ def moving_mean(error: Array, window: int) -> Array:
     """Mean of each link over the last `window` samples (T, E) [m], as `acquired` judges it; NaN without any."""
     total, count = sums_over_window(error, window)
     return np.asarray(np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0))
+
+
+def largest(values: Array) -> Array:
+    """Largest known value of each row (T, n); NaN without any."""
+    return np.asarray(np.fmax.reduce(values, axis=1, initial=np.nan))
 
 
 def network_away(alive: Mask, time: Array) -> tuple[float, Mask]:
@@ -344,10 +350,18 @@ class Measurement:
         self.leaders = () if len(leading) == len(trace.robots) else leading  # robots that means leave out
         self.bounds = bounds_of(trace)  # phases
 
+    @classmethod
+    def of(cls, trace: Trace) -> Measurement:
+        """Measurement that metrics, figures and replay of a trace share."""
+        if (found := _MEASURED.get(trace)) is None:
+            found = _MEASURED[trace] = cls(trace)
+        return found
+
     @_kept
     def window(self) -> int:
         """Samples of the moving mean."""
-        return max(1, round(WINDOW_S / float(self.trace.time[1] - self.trace.time[0])))
+        time = self.trace.time
+        return max(1, round(WINDOW_S / float(time[1] - time[0]))) if len(time) > 1 else 1
 
     @_kept
     def errors(self) -> LinkErrors:
@@ -358,6 +372,14 @@ class Measurement:
     def robot_errors(self) -> Array:
         """e_i(t) = Σ_j e_ij (T, N) [m] over the own links of each robot; NaN where none of them is known."""
         return robot_sums(self.errors.error, self.errors.own)
+
+    @_kept
+    def worst_links(self) -> Array:
+        """Error of the worst link of each follower (T, N) [m], as acquisition judges it; NaN where none is known."""
+        known = self.errors
+        mean = np.concatenate([moving_mean(known.error[begin:end], self.window) for _, begin, end in self.bounds])
+        followers = [row for row, name in enumerate(self.trace.robots) if name not in self.leaders]
+        return np.stack([largest(mean[:, known.own[:, row] > 0.0]) for row in followers], axis=1)
 
     @_kept
     def integrals(self) -> tuple[Array, Array, Array]:
@@ -519,3 +541,6 @@ class Measurement:
         if dropped is None:
             return np.zeros(rows, dtype=np.intp)
         return np.bincount(self.trace.plan.pose_links.sender, weights=dropped, minlength=rows).astype(np.intp)
+
+
+_MEASURED: Final = WeakKeyDictionary[Trace, Measurement]()

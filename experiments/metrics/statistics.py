@@ -13,6 +13,7 @@ import msgspec
 from experiments.metrics.comparable import SAME_COVERAGE, coverage, equally_long
 from experiments.metrics.metric import known_metrics
 from experiments.metrics.results import CaseMetrics
+from experiments.recording.trace import Trace
 
 
 def ratio(value: float | None, reference: float | None) -> float | None:
@@ -46,6 +47,11 @@ def by_case(cases: Sequence[CaseMetrics]) -> dict[str, list[CaseMetrics]]:
     for case in cases:
         grouped.setdefault(case.case, []).append(case)
     return grouped
+
+
+def first_seed(traces: Sequence[Trace]) -> list[Trace]:
+    """First trace of each case."""
+    return list({trace.case: trace for trace in reversed(traces)}.values())[::-1]
 
 
 def across_seeds(documents: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

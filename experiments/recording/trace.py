@@ -125,7 +125,7 @@ def poses_in_run(table: PoseTable, duration: float, by: Literal["stamp", "arriva
     return msgspec.structs.replace(kept, **{by: times}).take(np.argsort(times, kind="stable"))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Trace:
     """Trace of a case. Arrays over samples (T) and robots (N); times since the common start [s]."""
 

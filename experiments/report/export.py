@@ -161,7 +161,7 @@ def structure(trace: Trace, metrics: CaseMetrics) -> dict[str, Any]:
         **{name: getattr(trace, name) for name in ("case", "seed", "clock", "robots", *arrays)},
         "title": experiment.title,
         "kinds": [experiment.robots[name].kind for name in trace.robots],
-        "error": Measurement(trace).robot_errors,
+        "error": Measurement.of(trace).robot_errors,
         "tolerance": experiment.tolerance,
         "phase_start": phase_starts(trace),
         "sent": {

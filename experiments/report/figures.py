@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Final, Literal
 
 import numpy as np
@@ -23,11 +24,11 @@ from numpy.typing import NDArray
 from experiments.metrics.metric import ERRORS, FORMULA, known_metrics, measures_of
 from experiments.metrics.results import CaseMetrics
 from experiments.metrics.shadow import differences, in_heading
-from experiments.metrics.signals import WINDOW_S, Measurement, has_errors, moving_mean
-from experiments.metrics.statistics import Spread, by_case, ratios, spread
+from experiments.metrics.signals import Measurement, largest
+from experiments.metrics.statistics import Spread, by_case, first_seed, ratios, spread
 from experiments.recording.trace import Trace
 from experiments.report import style
-from experiments.report.metrics_files import Band
+from experiments.report.metrics_files import BANDS, Band, read_bands, write_bands
 from experiments.report.trajectories import LOW, formation, has_positions, plan_view
 from twins.arrays import Array
 
@@ -42,8 +43,6 @@ MOST_PANELS: Final = 16  # cases of a page, each with a panel
 MOST_SEEDS: Final = 50  # seeds of a case, for the range of its errors
 MOST_MEASURES: Final = 6  # measures of a law, each with a panel
 SOLID: Final = 0.95  # share of the time that marks cover where there is nothing to see between them
-
-__all__ = ["formation", "plan_view"]  # besides those of this module
 
 
 def all_figures(
@@ -68,7 +67,7 @@ def all_figures(
         figures["plan_view"] = plan_view(first, width)
         if any((trace.true_position[..., 2] > LOW).any() for trace in first):
             figures["formation"] = formation(first, width)
-    judged = [trace for trace in known if has_errors(trace.plan)]
+    judged = [trace for trace in known if Measurement.of(trace).has_errors]
     if judged:
         figures["errors"] = errors(judged, cases, width, bands)
     if any(trace.measures for trace in first):
@@ -82,6 +81,33 @@ def all_figures(
     if any(map(_rows, first)):
         figures["shadows"] = shadows(first, width)
     return figures
+
+
+def known_bands(traces: Sequence[Trace], seeds: int, folder: Path) -> dict[str, Band]:
+    """`error_bands` of all seeds; where most are not recorded, as their run has left them in its folder of figures."""
+    recorded = len({trace.seed for trace in traces}) == seeds
+    return ({} if recorded else read_bands(folder / BANDS)) or error_bands(traces)
+
+
+def draw(
+    folder: Path,
+    cases: Sequence[CaseMetrics],
+    traces: Sequence[Trace],
+    bands: Mapping[str, Band],
+    width: float,
+    *,
+    pdf: bool,
+) -> dict[str, str]:
+    """Draws all figures into a folder, and returns the SVG of each; bands over several seeds stand there as a table."""
+    over_seeds = max(band.seeds for band in bands.values()) > 1
+    of_one = len({case.seed for case in cases}) > 1 and not over_seeds  # a file that is there already is of all seeds
+    found = {
+        name: style.svg(figure) if of_one and name == "errors" else style.save(figure, folder, name, pdf=pdf)
+        for name, figure in all_figures(cases, traces, width, bands).items()
+    }
+    if over_seeds:
+        write_bands(folder / BANDS, bands)
+    return found
 
 
 @style.styled
@@ -206,8 +232,8 @@ def errors(
             axes.fill_between(band.time, band.low, band.high, color=line["color"], alpha=0.25, linewidth=0.0)
         elif name in first:
             few = style.thinned(first[name], 1)
-            for mine in _worst_links(first[name])[few].T:
-                axes.plot(band.time, mine, color=line["color"], linewidth=0.4, alpha=0.45)
+            for robot in Measurement.of(first[name]).worst_links[few].T:
+                axes.plot(band.time, robot, color=line["color"], linewidth=0.4, alpha=0.45)
         axes.plot(band.time, band.middle, **line, linewidth=1.3, zorder=3)
         handles[style.plain(name)] = Line2D([], [], **line, linewidth=1.3)
         known = band.middle[np.isfinite(band.middle) & (band.middle > 0.0)]
@@ -276,27 +302,12 @@ def error_bands(traces: Sequence[Trace]) -> dict[str, Band]:
     found = {}
     for name, runs in grouped.items():
         few = style.thinned(runs[0], 1)
-        robots = [_worst_links(trace)[few] for trace in runs[:MOST_SEEDS]]
+        robots = [Measurement.of(trace).worst_links[few] for trace in runs[:MOST_SEEDS]]
         length = min(map(len, robots))
-        worst = np.stack([_largest(each[:length]) for each in robots])
+        worst = np.stack([largest(each[:length]) for each in robots])
         time, middle = runs[0].time[few][:length], np.median(worst, axis=0)
         found[name] = Band(len(robots), time, middle, worst.min(axis=0), worst.max(axis=0))
     return found
-
-
-def _worst_links(trace: Trace) -> Array:
-    """Error of the worst link of each follower (T, N) [m], moving mean over one second; NaN where none is known."""
-    window = max(1, round(WINDOW_S / float(trace.time[1] - trace.time[0]))) if len(trace.time) > 1 else 1
-    shared = Measurement(trace)
-    known = shared.errors
-    mean = np.concatenate([moving_mean(known.error[begin:end], window) for _, begin, end in shared.bounds])
-    followers = [row for row, name in enumerate(trace.robots) if name not in shared.leaders]
-    return np.stack([_largest(mean[:, known.own[:, row] > 0.0]) for row in followers], axis=1)
-
-
-def _largest(values: Array) -> Array:
-    """Largest known value of each row (T, n); NaN without any."""
-    return np.asarray(np.fmax.reduce(values, axis=1, initial=np.nan))
 
 
 def _acquisitions(runs: Sequence[CaseMetrics]) -> list[float]:
@@ -379,7 +390,7 @@ def intervals(traces: Sequence[Trace], width: float = style.WIDTH) -> Figure:
     handles: dict[str, Line2D] = {}
     for k, trace in enumerate(traces):
         colour = style.CASES[k % len(style.CASES)]
-        shared = Measurement(trace)
+        shared = Measurement.of(trace)
         named = zip(shared.waits, trace.robots, strict=True)
         waits = [wait for wait, name in named if name not in shared.leaders and len(wait)]
         for wait in waits if len(waits) > 1 else []:
@@ -436,10 +447,6 @@ def _points(axes: Axes, x: NDArray[np.floating], found: Sequence[Spread], *, k: 
         elif each.mean is not None:
             edge: style.Line = {"xycoords": ("data", "axes fraction"), "ha": "center", "va": "bottom"}
             axes.annotate("0", (at, 0.02), fontsize=6, color=colour, **edge)
-
-
-def first_seed(traces: Sequence[Trace]) -> list[Trace]:
-    return list({trace.case: trace for trace in reversed(traces)}.values())[::-1]
 
 
 def _steps(waits: Array) -> tuple[Array, Array]:

@@ -159,6 +159,6 @@
     event.preventDefault(); far = Math.min(5 * size, Math.max(0.2 * size, far * Math.exp(event.deltaY / 500))); draw();
   };
   window.addEventListener("resize", draw);
-  root.hidden = false; root.previousElementSibling.hidden = true; // the still picture is for pages without a script
-  t = film.still; draw();
+  root.hidden = false;
+  t = film.at; draw();
 })

@@ -9,16 +9,16 @@ from typing import Any, Final
 
 import numpy as np
 
+from experiments.metrics.signals import Measurement
+from experiments.metrics.statistics import first_seed
 from experiments.recording.trace import Trace
-from experiments.report import figures, trajectories
-from experiments.report.page import inline, template
-from experiments.report.style import svg
+from experiments.report.page import template
 from experiments.scene.models import ROUND, circle
 from experiments.scene.stage import FAIR_M, GOOD_M, SceneModel, drawn_errors, link_levels
 from twins.arrays import Array
 
 CASES: Final = 2  # side by side
-STILL: Final = 0.6  # share of the run: time of the picture where no script runs, and in print
+FIRST: Final = 0.6  # share of the run: time of the first picture
 STEP_S: Final = 0.1  # pause of two samples
 NUMBERS: Final = 300_000  # limit for all samples: 2 MB
 QUIET: Final = ("robot", "output", "clock", "router")  # kinds of events that are not on the slider
@@ -27,31 +27,17 @@ SCRIPT: Final = Path(__file__).with_name("replay.js")
 
 def embedded(traces: Sequence[Trace]) -> str:
     """The replay as HTML: the first repetition of the first two cases, side by side; empty without a case."""
-    first = figures.first_seed(traces)[:CASES]
+    first = first_seed(traces)[:CASES]
     if not first:
         return ""
-    content = _replay_data(first)
-    film = json.dumps(content, separators=(",", ":"), ensure_ascii=True).replace("<", "\\u003c")
-    label = "Replay of " + ", ".join(trace.case for trace in first)
-    at = f"{content['still']:g}"
+    film = json.dumps(_replay_data(first), separators=(",", ":"), ensure_ascii=True).replace("<", "\\u003c")
     return template("replay.html.jinja").render(
-        label=label,
-        at=at,
-        still=_still_picture(first, content["still"], f"{label}, at {at} s"),
+        label="Replay of " + ", ".join(trace.case for trace in first),
         good=f"{100 * GOOD_M:g}",
         fair=f"{100 * FAIR_M:g}",
         script=SCRIPT.read_text("utf-8").replace("</", "<\\/").strip(),
         film=film,
     )
-
-
-def _still_picture(traces: Sequence[Trace], at: float, label: str) -> str:
-    """The picture of the replay at a time [s], as SVG; empty where no position is known."""
-    if not any(map(trajectories.has_positions, traces)):
-        return ""
-    figure, show = trajectories.film(traces)
-    show(at)
-    return inline(svg(figure), "still-", label)
 
 
 def _replay_data(traces: Sequence[Trace]) -> dict[str, Any]:
@@ -79,7 +65,7 @@ def _replay_data(traces: Sequence[Trace]) -> dict[str, Any]:
         "obstacles": obstacles,
         "begin": 0.0,
         "end": end,
-        "still": round(STILL * end, 2),
+        "at": round(FIRST * end, 2),
         "events": sorted(events),
         "cases": [_case(trace, step) for trace in traces],
     }
@@ -92,9 +78,7 @@ def _case(trace: Trace, step: float) -> dict[str, Any]:
     at = np.clip(np.searchsorted(trace.time, grid - 1e-9), 0, len(trace.time) - 1)
     place = trace.true_position[at]
     rows = np.concatenate([place, np.nan_to_num(trace.yaw[at])[..., None]], axis=2)
-    level = np.full((len(grid), len(stage.links)), -1)
-    if stage.plan is not None and len(stage.links):
-        level = link_levels(drawn_errors(stage.plan, grid, place))
+    level = link_levels(drawn_errors(trace.plan, grid, place, Measurement.of(trace).errors.error[at]))
     poses = np.stack([stage.scene.at(float(t)) for t in grid]).reshape(len(grid), -1)
     return {
         "name": trace.case,

@@ -13,7 +13,7 @@ import msgspec
 
 from experiments.metrics.measure import measure
 from experiments.metrics.results import CaseMetrics
-from experiments.metrics.statistics import by_case
+from experiments.metrics.statistics import by_case, first_seed
 from experiments.recording.run_folder import RunOrigin, read_origin
 from experiments.recording.trace import Trace
 from experiments.recording.version import provenance
@@ -71,10 +71,11 @@ def write(
     measured: Sequence[CaseMetrics] | None = None,
     notes: Sequence[str] = (),
     run: Path | None = None,
-    bands: Mapping[str, Band] | None = None,
-    drawings: Mapping[str, str] | None = None,
+    width: float = style.WIDTH,
+    pdf: bool = False,
+    drawn: bool = True,
 ) -> Path:
-    """Writes the report of one run; how and when it was made is in `run.json` in its folder.
+    """Writes the report of one run and its figures; how and when it was made is in `run.json` in its folder.
 
     Args:
         traces: The cases of the run, the reference first; several seeds of a case become means with 95 % intervals,
@@ -85,8 +86,9 @@ def write(
         notes: What the reader should know besides: a damaged recording, robots that were lost. That runs were
             interrupted is seen from the traces.
         run: Folder of the run; the same as `folder` if left out.
-        bands: Errors over all seeds, where most of their traces are not known.
-        drawings: SVG of every figure by its name, if they were drawn already.
+        width: Width of the figures [in].
+        pdf: Figures as PDF, too.
+        drawn: False for a page without figures.
 
     Raises:
         ValueError: If there is no trace (no robot had started: there is nothing to report), or one of less than two
@@ -95,7 +97,7 @@ def write(
     if not traces:
         raise ValueError("there is no case to report: no robot had started")
     cases = [measure(trace) for trace in traces] if measured is None else measured
-    first = figures.first_seed(traces)
+    first = first_seed(traces)
     experiment = traces[0].plan.experiment
     seeds = sorted({case.seed for case in cases})
     folder.mkdir(parents=True, exist_ok=True)
@@ -110,10 +112,8 @@ def write(
         ("Robots", str(len(traces[0].robots))),
         ("Cases", ", ".join(by_case(cases))),
     ]
-    bands = bands or figures.error_bands(traces)
-    if drawings is None:
-        drawn = figures.all_figures(cases, traces, bands=bands)
-        drawings = {name: style.svg(figure) for name, figure in drawn.items()}
+    bands = figures.known_bands(traces, len(seeds), Path(run or folder) / "figures")
+    drawings = figures.draw(folder / "figures", cases, traces, bands, width, pdf=pdf) if drawn else {}
     pictures = _pictures(cases, traces, bands, drawings)
     short, every_event = tables.events_tables(first)
     listing = text or msgspec.json.format(msgspec.json.encode(experiment), indent=2).decode()

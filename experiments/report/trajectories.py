@@ -21,8 +21,8 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection  # type: ignore[import-u
 
 from agents.body.kinds import KINDS
 from experiments.check.analysis import Analysis
-from experiments.definition.formation import errors_over_time
 from experiments.definition.graph import edges
+from experiments.metrics.signals import Measurement
 from experiments.recording.trace import Trace
 from experiments.report import scenery, style
 from experiments.scene.stage import link_colours
@@ -267,9 +267,7 @@ def film(traces: Sequence[Trace]) -> tuple[Figure, Callable[[float], None]]:
             few = len(trace.robots) <= style.MAX_COLOURED_ROBOTS
             halo = {"path_effects": style.HALO, "zorder": 7}
             names = [axes.text(0, 0, 0, name, fontsize=6, ha="center", **halo) for name in trace.robots if few]
-            plan = trace.plan
-            error = errors_over_time(plan.law, plan.formation, trace.time, trace.true_position)
-            parts.append((trace, links, trails, dots, names, error))
+            parts.append((trace, links, trails, dots, names, Measurement.of(trace).errors.error))
         if any(len(trace.robots) > style.MAX_COLOURED_ROBOTS for trace in shown):
             style.robot_legend(figure, shown)
 

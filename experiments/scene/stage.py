@@ -384,10 +384,14 @@ class LinkTracker:
         return np.where(there, sums_of_errors(self._stage, error), np.nan)
 
 
-def drawn_errors(plan: Plan, time: Array, position: Array) -> Array:
-    """Errors of links (T, E) [m] as `LinkTracker` gives them, along true positions (T, N, 3) at times (T,)."""
+def drawn_errors(plan: Plan, time: Array, position: Array, error: Array | None = None) -> Array:
+    """Errors of links (T, E) [m] as `LinkTracker` gives them, along true positions (T, N, 3) at times (T,).
+
+    Args:
+        error: Result of `errors_over_time`, if it is known already.
+    """
     pattern = plan.formation
-    error = errors_over_time(plan.law, pattern, time, position)
+    error = errors_over_time(plan.law, pattern, time, position) if error is None else error
     there = pattern.present(time, position)
     bare = ~targeted(plan.law, pattern) if there is None else there & ~targeted(plan.law, pattern)
     return np.where(bare, BARE, error)

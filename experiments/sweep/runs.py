@@ -40,6 +40,8 @@ from experiments.virtual_time.simulation import simulate
 # modules that no line imports because they are, or may be, plug-ins
 PLUG_INS: Final = ("agents/**/*.py", "twins/**/*.py", "bridges/*/kind.py", "bridges/*/mujoco/*.py")
 WORK: Final = "experiments/sweep/runs.py"  # this module: with what it imports, all other code that determines results
+# modules that draw a run or write it down: no figure depends on them
+DRAWING: Final = ("experiments/scene/", "experiments/recording/writer.py", "experiments/recording/ros2/")
 _IMPORT: Final = re.compile(r"^\s*(?:from\s+([\w.]+)\s+)?import\s+(\([^)]*\)|.*)", re.MULTILINE)
 _COMMENT: Final = re.compile(r"\n?[^\S\n]*#[^\"'\n]*$|\n(?=\n)", re.MULTILINE)  # comments and blank lines
 FAILED: Final = (Stuck, BodyError, registry.PluginError)  # what a run may end with that other runs do not
@@ -118,19 +120,20 @@ def code_of(plan: Plan) -> str:
 
 @cache
 def digest_of_code(root: Path = ROOT) -> str:
-    """Digest of our modules that determine results, without their comments; those of reports are not among them."""
+    """Digest of our modules that determine results, without their comments; none of reports, scenes and recordings."""
     total, seen = hashlib.sha256(), set[Path]()
     left = [root / WORK, *(file for pattern in PLUG_INS for file in root.glob(pattern))]
     texts = dict[str, str]()
     while left:
         file = left.pop()
-        if file in seen or not file.is_file():
+        name = file.relative_to(root).as_posix()
+        if file in seen or name.startswith(DRAWING) or not file.is_file():
             continue
         seen.add(file)
-        texts[file.relative_to(root).as_posix()] = text = without_comments(file.read_text("utf-8"))
+        texts[name] = text = without_comments(file.read_text("utf-8"))
         for package, names in _IMPORT.findall(text):
-            for name in (package, *(f"{package}.{each}".strip(".") for each in re.findall(r"[\w.]+", names))):
-                place = root / name.replace(".", "/")
+            for module in (package, *(f"{package}.{each}".strip(".") for each in re.findall(r"[\w.]+", names))):
+                place = root / module.replace(".", "/")
                 left += [place.with_suffix(".py"), place / "__init__.py"]
     for name, text in sorted(texts.items()):
         total.update(f"{name}\0{len(text)}\0{text}".encode())

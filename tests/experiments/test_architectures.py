@@ -132,7 +132,7 @@ def test_the_report_compares_them(tmp_path):
     assert (cells["Decides"], cells["Delay, mean [ms]"], own) == (("every robot", "the centre"), ("–", "110"), "1.00")
     assert float(more) > 1.0
     assert any("a centre decides for TB01" in finding.text for finding in findings(found))
-    page, alone = (report.write(tmp_path, traces[:n], measured=found[:n], drawings={}).read_text() for n in (2, 1))
+    page, alone = (report.write(tmp_path, traces[:n], measured=found[:n], drawn=False).read_text() for n in (2, 1))
     assert ["Architecture</h2>" in text for text in (page, alone)] == [True, False]
     metrics_files.write_csv(tmp_path / "metrics.csv", found)
     row = list(csv.DictReader((tmp_path / "metrics.csv").read_text().splitlines()))[9]

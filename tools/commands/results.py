@@ -312,39 +312,20 @@ def summary(runs: Sequence[Run]) -> dict[str, Any]:
 
 
 def write_report(runs: Sequence[Run], folder: Path, width: float = 3.5, *, pdf: bool = False) -> Path:
-    """Write figures and report of a run into its folder; return the report.
-
-    Of seeds that are not recorded the figure of errors is drawn from the table that the run has left beside it.
-    """
-    from experiments.report import figures, metrics_files, style
+    """Write figures and report of a run into its folder; return the report."""
     from experiments.report import report as pages
     from experiments.report.page import date_of
 
-    every = [case for each in runs for case in each.metrics.values()]
-    traces = [trace for each in runs for trace in each.traces.values()]
-    recorded = len({trace.seed for trace in traces}) == len(runs)
-    place = Path(runs[0].folder or folder) / "figures" / metrics_files.BANDS
-    kept = {} if recorded else metrics_files.read_bands(place)
-    bands = kept or figures.error_bands(traces)
-    of_all = recorded or bool(kept)  # seeds
-    drawn = figures.all_figures(every, traces, width, bands)
-    stays = [] if of_all else ["errors"]  # the one that is there is of all seeds
-    drawings = {
-        name: style.svg(figure) if name in stays else style.save(figure, folder / "figures", name, pdf=pdf)
-        for name, figure in drawn.items()
-    }
-    if len(runs) > 1 and of_all:
-        metrics_files.write_bands(folder / "figures" / metrics_files.BANDS, bands)
     return pages.write(
         folder,
-        traces,
+        [trace for each in runs for trace in each.traces.values()],
         date=date_of(runs[0].made),
         run=runs[0].folder,
         text=runs[0].source,
-        measured=every,
-        notes=[n for each in runs for n in each.notes],
-        bands=bands,
-        drawings=drawings if width == style.WIDTH else None,
+        measured=[case for each in runs for case in each.metrics.values()],
+        notes=[note for each in runs for note in each.notes],
+        width=width,
+        pdf=pdf,
     )
 
 

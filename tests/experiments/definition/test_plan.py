@@ -39,7 +39,7 @@ from experiments.definition.experiment import (
     RobotTable,
     Start,
 )
-from experiments.definition.graph import adjacency, components, degree, edges, laplacian, links, reachable
+from experiments.definition.graph import adjacency, components, degree, edges, links, reachable
 from experiments.definition.plan import Plan
 from experiments.definition.rigidity import bend, redundancy, rigidity
 from experiments.file import document
@@ -68,7 +68,6 @@ def test_graph_is_that_of_networkx(rows, data):
     a = nx.to_numpy_array(graph, nodelist=range(rows))
     np.testing.assert_array_equal(adjacency(net, rows), a)
     np.testing.assert_array_equal(np.diag(degree(net, rows)), a.sum(axis=1))
-    np.testing.assert_array_equal(laplacian(net, rows), np.diag(a.sum(axis=1)) - a)
     assert components(net, rows) == nx.number_weakly_connected_components(graph)
     assert {tuple(edge) for edge in edges(net).tolist()} == {tuple(sorted(pair)) for pair in pairs}
     sources = data.draw(st.lists(st.integers(0, rows - 1), unique=True, max_size=3))
@@ -78,7 +77,7 @@ def test_graph_is_that_of_networkx(rows, data):
 
 def test_links_take_pairs_with_or_without_targets():
     path = links([(1, 0), (0, 1), (2, 1), (1, 2)])
-    assert laplacian(path, 3).tolist() == [[1, -1, 0], [-1, 2, -1], [0, -1, 1]]
+    assert adjacency(path, 3).tolist() == [[0, 1, 0], [1, 0, 1], [0, 1, 0]]
     assert np.isnan(path.distance).all()
     assert links([(1, 0), (2, 0)], 0.6, 3.0).distance.tolist() == [0.6, 0.6]
     assert links([(1, 0), (2, 0)], 0.6, [3.0, 4.0]).gain.tolist() == [3.0, 4.0]

@@ -136,7 +136,7 @@ def test_report_over_seeds_gives_intervals(tmp_path):
     assert re.fullmatch(r"\d\.\d+ ± 0\.\d+, × \d\.\d+ ± 0\.\d+", f"{cells[1]}, {cells[2][1]}")
     scattered = runs[0].plan.changed(start=Start(scatter=0.1))
     apart = [dataclasses.replace(each, plan=scattered) for each in runs]
-    assert "begin at the same poses" not in page_of(tmp_path / "b", *apart, drawings={}).words
+    assert "begin at the same poses" not in page_of(tmp_path / "b", *apart, drawn=False).words
 
 
 def test_comparison_has_a_column_per_run_and_case(tmp_path, two_cases):
@@ -156,7 +156,7 @@ def test_comparison_has_a_column_per_run_and_case(tmp_path, two_cases):
 
 def test_one_of_two_cases_interrupted(tmp_path):
     traces = park("a"), cut(park("b", 0.01), 10.0)
-    page = page_of(tmp_path, *traces, drawings={}).words
+    page = page_of(tmp_path, *traces, drawn=False).words
     assert "b was interrupted after 10.0 s of 45 s" in page.split("In short")[2]
     said = "\n".join(marks_of(*traces))
     assert said.startswith("b was interrupted after 10.0 s of 45 s: all its figures are up to there.\n")
@@ -171,13 +171,13 @@ def test_one_of_two_cases_interrupted(tmp_path):
 def test_a_report_made_again_keeps_date_and_command(tmp_path):
     known = crowd(3, duration=2.0)
     (tmp_path / "run.json").write_bytes(msgspec.json.encode(RunOrigin("zenpark run x.toml", "2031-02-03")))
-    words = page_of(tmp_path / "new", known, run=tmp_path, date="2032-01-01", drawings={}).words
+    words = page_of(tmp_path / "new", known, run=tmp_path, date="2032-01-01", drawn=False).words
     assert [part in words for part in ("zenpark run x.toml", "2031-02-03", "2032")] == [True, True, False]
     assert not (tmp_path / "new" / "run.json").exists()
     other = tmp_path / "case" / "run.json"
     other.parent.mkdir()
     other.write_text('{"title": "the case named run"}')  # another file of that name is left alone
-    words = page_of(other.parent, known, date=date_of(1.76e9), drawings={}).words
+    words = page_of(other.parent, known, date=date_of(1.76e9), drawn=False).words
     shown = [part in words for part in ("2025-10-09 08:53 UTC", '"duration_s": 2.0', "Reproduce")]
     assert shown == [True, True, False], "the experiment is shown even without its file"
     assert other.read_text() == '{"title": "the case named run"}'

@@ -174,6 +174,9 @@ def copied(tmp_path_factory):
     ("file", "old", "new", "same"),
     [
         (REPORT, "WIDE: Final = 8.0", "WIDE: Final = 9.0", True),
+        ("experiments/recording/writer.py", "return", "return  -", True),
+        ("experiments/scene/stage.py", "return", "return  -", True),
+        ("experiments/recording/trace.py", "return", "return  -", False),
         ("experiments/check/motion.py", "import", "import antigravity\nimport", True),
         (LAW, "from __future__", "# a remark\n\nfrom __future__", True),
         (LAW, "return", "return  -", False),
