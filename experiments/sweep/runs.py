@@ -126,8 +126,10 @@ def digest_of_code(root: Path = ROOT) -> str:
     texts = dict[str, str]()
     while left:
         file = left.pop()
+        if file in seen or not file.is_file():
+            continue
         name = file.relative_to(root).as_posix()
-        if file in seen or name.startswith(DRAWING) or not file.is_file():
+        if name.startswith(DRAWING):
             continue
         seen.add(file)
         texts[name] = text = without_comments(file.read_text("utf-8"))
