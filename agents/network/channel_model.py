@@ -43,6 +43,7 @@ def uniform(word: int, counter: int) -> float:
 
 
 ROUNDING_S: Final = 2e-6  # stamps on the wire are whole microseconds, and sums of binary fractions miss the ticks
+QUEUE_S: Final = 0.5  # a sample that would wait longer for its link to be free is dropped
 LOSS, JITTER, USES = 0, 1, 2  # random numbers of each sample: two, by their index
 
 
@@ -62,9 +63,6 @@ class LinkEffects(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     bandwidth: Annotated[Positive | None, Meta(description="of each link [bit/s] of payload; left out: no limit")] = (
         None
     )
-    queue_s: Annotated[
-        Delay, Meta(description="a sample that would wait longer for its link to be free is dropped [s]")
-    ] = 0.5
 
 
 class Conditions(msgspec.Struct, frozen=True):
@@ -89,7 +87,7 @@ class Conditions(msgspec.Struct, frozen=True):
             loss=effects.loss,
             burst=nan if effects.burst is None else effects.burst,
             bandwidth=inf if effects.bandwidth is None else effects.bandwidth,
-            queue=effects.queue_s,
+            queue=QUEUE_S,
             outages=tuple(outages),
             duration=duration,
         )

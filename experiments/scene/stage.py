@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.body.kinds import Kind
-from agents.decision.lifecycle import FINISHED, SCRIPTED, TOLD_TO_END, Phase
+from agents.decision.lifecycle import FINISHED, TOLD_TO_END, Phase
 from agents.kinds.theory import POINT
 from agents.network.messages import EMERGENCY, Ranges, State, Status, WorldState
 from agents.plugins import registry
@@ -101,7 +101,7 @@ CONDITIONS: Final[dict[Condition, tuple[str, Colour]]] = {
 RINGED: Final = (Condition.LANDING, *(each for each in Condition if each >= Condition.HELD))
 AT_REST: Final = (Condition.WAITING, Condition.DONE, Condition.OUT)  # their goals are not drawn
 PALED: Final = (Condition.OUT, Condition.SILENT, Condition.STOPPED, Condition.DEAD)
-IN_TIME: Final = (FINISHED, SCRIPTED, TOLD_TO_END, "")  # reasons of a robot that has done all of its plan
+IN_TIME: Final = (FINISHED, TOLD_TO_END, "")  # reasons of a robot that has done all of its plan
 
 
 def condition(

@@ -312,11 +312,11 @@ def test_default_delay_is_a_millisecond_or_nothing_really():
 
 def test_links_have_their_own():
     own = {"A > C": LinkChannelTable(loss=0.3, burst=4.0), "A - B": LinkChannelTable(delay_s=0.1, bandwidth=1e4)}
-    made = conditions(ChannelTable(loss=0.1, jitter_s=0.01, queue_s=0.2, links=own))
+    made = conditions(ChannelTable(loss=0.1, jitter_s=0.01, links=own))
     assert [link.key for link in made] == [channel_model.key(1, *names) for names in ENDS]  # by the seed
     found = [(link.loss, link.burst, link.delay, link.bandwidth, link.jitter, link.queue) for link in made]
     both, of_c, usual = (0.1, np.nan, 0.1, 1e4), (0.3, 4.0, 0.001, np.inf), (0.1, np.nan, 0.001, np.inf)
-    np.testing.assert_array_equal(found, [(*each, 0.01, 0.2) for each in (both, both, of_c, usual)])
+    np.testing.assert_array_equal(found, [(*each, 0.01, 0.5) for each in (both, both, of_c, usual)])
 
 
 def test_outages_of_links_of_robots_and_of_all():
