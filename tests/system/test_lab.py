@@ -1,7 +1,7 @@
 """A lab in use: one command runs an experiment, certificates are revoked and renewed while routers run."""
 
 import threading
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from shutil import copytree
 
@@ -67,14 +67,21 @@ def test_revoked_key_is_refused_by_a_running_router(laboratory, tmp_path):
 
         until(lambda: heard(thief, "before"), "the key is good")
         authority.revoke(laboratory.folder, ["KH01"])
-        # the operator's certificate is the same as ever: it is connected again by itself
-        with laboratory.session("KH01") as honest:
-            until(lambda: heard(honest, "after"), "the new key is good")
-        threading.Event().wait(0.3)
-        with laboratory.session("KH01", stolen) as again:
+        with ExitStack() as stack:
+
+            def enter(folder):
+                with suppress(zenoh.ZError):  # the router looks at its files now and then, or refuses at once
+                    return [stack.enter_context(laboratory.session("KH01", folder))]
+                return []
+
+            # the operator's certificate is the same as ever: it is connected again by itself
+            honest: list[zenoh.Session] = []
+            until(lambda: honest or honest.extend(enter(laboratory.folder)), "the new key is let in")
+            until(lambda: heard(honest[0], "after"), "the new key is good")
+            threading.Event().wait(0.3)
+            speakers = [thief, *enter(stolen)]
             for _ in range(20):
-                assert not heard(thief, "thief")
-                assert not heard(again, "again")
+                assert not any(heard(each, "stolen") for each in speakers)
                 threading.Event().wait(0.02)
 
 
