@@ -47,6 +47,7 @@ def test_thousands_of_scripts_break_no_rule(part):
     assert not (found := failures(range(first, first + NIGHTLY_EACH))), found
 
 
+@pytest.mark.slow
 def test_seeds_repeat_to_the_last_switch():
     seeds = ["3", "7"]  # a capture and a world
     printed = set()
@@ -65,6 +66,7 @@ def test_flight_asks_nothing_of_the_real_world():
         laboratory.fly("triangle", case="event", mutant=asks)
 
 
+@pytest.mark.slow
 def test_broken_rule_is_shrunk_to_its_faults():
     blind = laboratory.Mutant("agents/safety/detection.py", "found |= 1 << Cause.ROUTER", "found |= 0")
     noise = [Fault(t, "late", "KH01", 0.005, 0.2) for t in (0.5, 1.0, 4.0, 5.0)]

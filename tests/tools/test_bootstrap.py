@@ -239,6 +239,8 @@ def test_tests_run_in_three_parts_or_as_given(bootstrap, started_modules):
     for part, workers, whole_runs in ((devices, "2", False), (runs, "1", True)):
         assert part[2:5] == ["mechanism", "-n", workers]
         assert {file.startswith("tests/system/") for file in part if file.startswith("tests/")} == {whole_runs}
-    assert started("--quick", "tests/agents", "-x", code=-9) == [["pytest", "-m", bootstrap.QUICK, "tests/agents", "-x"]]
+    assert started("--quick", "tests/agents", "-x", code=-9) == [
+        ["pytest", "-m", bootstrap.QUICK, "tests/agents", "-x"]
+    ]
     modules = [module[0] for module in started("--all")]
     assert modules == ["pytest", "tests.fuzz", "tests.system.zenohd", "tests.system.rclpy_wheels", "pytest"]

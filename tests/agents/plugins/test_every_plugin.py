@@ -23,6 +23,7 @@ from experiments.catalogue import index
 from experiments.definition.plan import Plan
 from experiments.file import document
 from tests.agents.bench import Bench, near, own
+from tests.cases import mostly_slow
 from tests.small import triangle
 
 GROUPS = (LAWS, TRIGGERS, PREDICTORS, PLANNERS, AVOIDANCES)
@@ -123,7 +124,7 @@ def lives(given, company):
     return trace
 
 
-@pytest.mark.parametrize(("group", "name"), EVERY)
+@pytest.mark.parametrize(("group", "name"), mostly_slow(EVERY, 4))
 def test_same_alone_and_in_company(group, name):
     given = assignment(group, name)
     assert lives(given, 0) == lives(given, 2)
@@ -154,7 +155,7 @@ def started(group, name):
     return bench, bear
 
 
-@pytest.mark.parametrize(("group", "name"), EVERY)
+@pytest.mark.parametrize(("group", "name"), mostly_slow(EVERY, 4))
 def test_losses_and_restarts_are_borne(group, name):
     bench, bear = started(group, name)
     for link, every_tick in ((0, tick), (1, follow_setpoint)):  # one, then all
@@ -174,7 +175,7 @@ def test_losses_and_restarts_are_borne(group, name):
         bear(0.3, follow_setpoint)
 
 
-@pytest.mark.parametrize(("group", "name"), EVERY)
+@pytest.mark.parametrize(("group", "name"), mostly_slow(EVERY, 4))
 def test_unknown_positions_and_velocities_are_borne(group, name):
     bench, bear = started(group, name)
     place = bench.position

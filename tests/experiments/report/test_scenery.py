@@ -82,6 +82,7 @@ def test_spatial_obstacles_reach_over_the_shown_height():
     assert (heights[-1].min(), heights[-1].max()) == pytest.approx((0.0, 0.2))
 
 
+@pytest.mark.slow
 def test_space_shows_whole_arena_unless_far_larger():
     assert in_space(EMPTY).get_xlim() == pytest.approx((-1.08 * 1.1, 1.08 * 1.1))
     assert np.ptp(in_space(HALL).get_xlim()) < 3.0

@@ -100,6 +100,7 @@ def test_no_style_of_the_process_changes_pictures(tmp_path):
     assert [name for name, picture in plain.items() if styled[name] != picture] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("folder", "variable"),
     [

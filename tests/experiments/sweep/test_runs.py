@@ -170,6 +170,7 @@ def copied(tmp_path_factory):
     return root, digest_of_code.__wrapped__(root)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("file", "old", "new", "same"),
     [
