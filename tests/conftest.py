@@ -27,7 +27,7 @@ from tests.waiting import until
 for name, most in (("zenpark", 35), ("quick", 5), ("all", 100)):  # profiles of `./zenpark test` and its options
     hypothesis_settings.register_profile(name, deadline=None, max_examples=most)  # the machine may be slow
 hypothesis_settings.load_profile("zenpark")
-# no test may find the runs of whoever uses this machine, least of all to stop them, or the verdicts of former checks
+# no test may find the runs of whoever uses this machine, least of all to stop them
 os.environ["ZENPARK_RUNTIME_DIR"] = tempfile.mkdtemp(prefix="zenpark-tests-")
 os.environ["ZENPARK_CACHE_DIR"] = tempfile.mkdtemp(prefix="zenpark-cache-")
 

@@ -27,7 +27,6 @@ from agents.network import session as network_session
 from agents.plugins import calls
 from agents.runtime import command_line, lifeline, loop, telemetry
 from agents.safety.hazards import Hazards
-from experiments.check import kept
 from experiments.real_time.conductor import conduct, orders, run_view
 from experiments.real_time.conductor import conductor as conducting
 from experiments.real_time.hosts import launcher, run_registry
@@ -103,7 +102,6 @@ def _patch_processes() -> None:
         "" if any(each.pid == pid and not each.dead for each in sim.current().processes) else None
     )
     run_registry.RegisteredRun._is_of_user = lambda _: True
-    kept.KeptVerdict = lambda *_: None
     run_command.sound = lambda *_, **__: True  # the check flies ideal runs, which the scripts do not need
     builtins.open = io.open = processes.open_file
     writer.TemporaryFile = processes.temporary_file

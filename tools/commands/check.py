@@ -32,7 +32,7 @@ from tools.options import (
 if TYPE_CHECKING:
     from experiments.check.analysis import Analysis
     from experiments.check.findings import CheckNumbers, Finding
-    from experiments.check.kept import KeptVerdict, Verdict
+    from experiments.file.document import Document
     from experiments.real_time.conductor.preflight_checks import RobotChecks
 
 app: Final = typer.Typer()
@@ -50,46 +50,30 @@ def check(
     as_json: AsJson = False,
 ) -> int:
     """Check an experiment file and say what theory says of it; exit code 2 for errors of the file, 1 of theory."""
-    from experiments.check.kept import KeptVerdict
+    from experiments.check.check import analyses, examine, unreadable
+    from experiments.file import document
     from experiments.file.problems import DocumentError
 
     if plot is not None and plot.suffix not in {".svg", ".pdf", ".png"}:
         raise typer.BadParameter(f"{plot}: the name must end in .svg, .pdf or .png", param_hint="--plot")
-    kept = KeptVerdict(file, settings or [])
-    verdict = kept.read() if plot is None and not fix else None
-    analysed: dict[str, Analysis] = {}
-    if verdict is None or verdict.figures is None:
-        try:
-            verdict, analysed = _examined(file, settings or [], kept)
-        except DocumentError as error:
-            if not as_json:
-                raise
-            from experiments.check.check import unreadable
-
-            _print_json(file, [unreadable(each) for each in error.problems], {})
-            return 2
+    try:
+        given = document.read(file, settings or [])
+        analysed = analyses(given.cases())
+    except DocumentError as error:
+        if not as_json:
+            raise
+        _print_json(file, [unreadable(each) for each in error.problems], {})
+        return 2
+    findings, numbers = examine(given, analysed)
     if as_json:
-        _print_json(verdict.path, verdict.findings, verdict.figures or {})
+        _print_json(str(given.path), findings, numbers)
     else:
-        _print_table(verdict)
+        _print_table(given, findings, numbers)
     if fix and not as_json:
         _print_fitting(analysed)
     if plot is not None:
         _draw(analysed, plot)
-    return 1 if any(each.severity == "error" for each in verdict.findings) else 0
-
-
-def _examined(file: str, settings: Sequence[str], kept: KeptVerdict) -> tuple[Verdict, dict[str, Analysis]]:
-    """Verdict on a file, which is kept, and what is known of each case; raises DocumentError."""
-    from experiments.check.check import analyses, examine
-    from experiments.check.kept import Verdict
-    from experiments.file import document
-
-    given = document.read(file, settings)
-    analysed = analyses(given.cases())
-    verdict = Verdict(str(given.path), given.experiment.title, *examine(given, analysed))
-    kept.keep(verdict)
-    return verdict, analysed
+    return 1 if any(each.severity == "error" for each in findings) else 0
 
 
 def _print_fitting(analysed: Mapping[str, Analysis]) -> None:
@@ -204,20 +188,20 @@ def _print_json(file: str, found: Sequence[Finding], numbers: Mapping[str, Check
     print_json({"file": file, "ok": ok, "findings": found, "figures": numbers})
 
 
-def _print_table(verdict: Verdict) -> None:
+def _print_table(read: Document, findings: Sequence[Finding], numbers: Mapping[str, CheckNumbers]) -> None:
     from experiments.check.findings import MARK
 
     width = _width()
-    lines = [f"{verdict.path}: {verdict.title}", ""]
-    for each in verdict.findings:
+    lines = [f"{read.path}: {read.experiment.title}", ""]
+    for each in findings:
         lines += textwrap.wrap(each.message, width, initial_indent=f"{MARK[each.severity]} ", subsequent_indent="  ")
         if each.severity in {"error", "warning"}:
             remedy = f"{each.where}: {each.remedy}" if each.where else each.remedy
             lines += textwrap.wrap(
                 remedy, width, initial_indent="    ", subsequent_indent="    ", break_on_hyphens=False
             )
-    lines += ["", *_rows(verdict.figures or {}), ""]
-    count = {severity: sum(each.severity == severity for each in verdict.findings) for severity in MARK}
+    lines += ["", *_rows(numbers), ""]
+    count = {severity: sum(each.severity == severity for each in findings) for severity in MARK}
     lines.append(f"{_counted(count['error'], 'error')}, {_counted(count['warning'], 'warning')}")
     _print_text("\n".join(lines))
 

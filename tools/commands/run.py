@@ -38,7 +38,6 @@ from tools.options import (
 from tools.terminal import lasting_console, say
 
 if TYPE_CHECKING:
-    from experiments.check.kept import KeptVerdict
     from experiments.file.document import Document
     from experiments.metrics.results import CaseMetrics
     from experiments.real_time.conductor.conduct import RunOptions
@@ -112,7 +111,6 @@ def run(
 
 def _run(origin: RunOrigin, handling: Handling, *, former: Path | None = None, bundle: str = "") -> int:
     """Run an experiment; of a `bundle`, in virtual time the results are compared with those of the folder `former`."""
-    from experiments.check.kept import KeptVerdict
     from experiments.file.document import load
     from experiments.metrics.criteria import has_passed, judge
     from experiments.real_time.conductor.conduct import RunOptions
@@ -121,14 +119,11 @@ def _run(origin: RunOrigin, handling: Handling, *, former: Path | None = None, b
     from experiments.report import verdict
 
     options = RunOptions(origin.cases, origin.bodies, origin.here, handling.lab, handling.identity)
-    kept = KeptVerdict(origin.file, origin.changes, origin.cases)
     read = load(origin.file, *origin.changes)
     check_folder(handling.out)
     _refuse(origin, handling)
     real = not origin.virtual and origin.bodies is None
-    if not sound(
-        read, kept, origin.cases, real=real, seeds=origin.seeds, as_json=handling.as_json, anyway=origin.anyway
-    ):
+    if not sound(read, origin.cases, real=real, seeds=origin.seeds, as_json=handling.as_json, anyway=origin.anyway):
         return 2
     if not origin.virtual:
         from experiments.real_time.conductor.conduct import with_bodies
@@ -355,25 +350,17 @@ def _refuse(origin: RunOrigin, handling: Handling) -> None:
             raise refusal("--seeds", "one run is viewed", "leave out --view or --seeds")
 
 
-def sound(
-    read: Document, kept: KeptVerdict, cases: Sequence[str] = (), *, real: bool, seeds: int, as_json: bool, anyway: bool
-) -> bool:
+def sound(read: Document, cases: Sequence[str] = (), *, real: bool, seeds: int, as_json: bool, anyway: bool) -> bool:
     """Print the warnings and errors of the check of a run, errors that prevent it as JSON too; False if there are such.
 
     Of the devices of robots only those of a run with `real` bodies.
 
     Raises DocumentError if there is no such case.
     """
+    from experiments.check.check import check
     from experiments.check.findings import DEVICE, NOT_RANDOM
-    from experiments.check.kept import Verdict
 
-    verdict = kept.read()
-    if verdict is None:
-        from experiments.check.check import check
-
-        verdict = Verdict(str(read.path), read.experiment.title, check(read, cases), None)
-        kept.keep(verdict)
-    found = [finding for finding in verdict.findings if finding.severity in {"error", "warning"}]
+    found = [finding for finding in check(read, cases) if finding.severity in {"error", "warning"}]
     if not real:
         found = [finding for finding in found if finding.code != DEVICE]
     if seeds == 1:

@@ -76,16 +76,15 @@ def sweep(
     open_report: OpenReport = False,
 ) -> int:
     """Run cases x values x seeds in virtual time on all cores; finished runs are never repeated."""
-    from experiments.check.kept import KeptVerdict
     from experiments.file.document import load
     from experiments.recording.run_folder import SWEEP, naming
     from experiments.sweep import table as tables
     from tools.commands.run import sound
 
     changes = settings or []
-    kept, read = KeptVerdict(file, changes), load(file, *changes)
+    read = load(file, *changes)
     _parse_axes(read, file, changes, given or [], case or [])
-    if not sound(read, kept, real=False, seeds=2, as_json=as_json, anyway=anyway):
+    if not sound(read, real=False, seeds=2, as_json=as_json, anyway=anyway):
         return 2
     options = {"settings": changes, "cases": case or [], "out": out, "scheduler": scheduler, "processes": processes}
     if optimise is None:
