@@ -145,7 +145,7 @@ class ExternalBody(Body):
         self._orders = [
             pubsub.publisher(session, keys.setpoint(name), mime, zenoh.Priority.REAL_TIME) for name in self._names
         ]
-        wait_until(lambda: not self._missing_positions(), deadline - time.monotonic(), POLL_S)
+        wait_until(lambda: not self._missing_positions(), deadline - time.monotonic())
         if missing := self._missing_positions():
             self.close()
             raise BodyError("\n".join(missing))

@@ -17,7 +17,7 @@ import typer
 from experiments.catalogue import index
 
 ROOT: Final = Path(__file__).resolve().parents[1]
-PACKAGES: Final = Path(typer.__file__).parents[1]
+SITE_PACKAGES: Final = Path(typer.__file__).parents[1]
 FIND_KEYS: Final = """
 import re
 from experiments.file.reference import entries
@@ -98,7 +98,7 @@ def _keys() -> list[str]:
     """
     from agents.user_folder import runtime_folder  # noqa: PLC0415 - other completion is quicker without
 
-    places = [*(ROOT / "experiments" / "definition").glob("*.py"), PACKAGES]
+    places = [*(ROOT / "experiments" / "definition").glob("*.py"), SITE_PACKAGES]
     try:
         kept = runtime_folder() / f"keys-{max(place.stat().st_mtime_ns for place in places):x}.txt"
         if not kept.exists():

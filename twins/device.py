@@ -29,7 +29,6 @@ from twins.models.motion import Motion
 CaptureFault = Literal[
     "", "frozen", "repeated", "swapped", "renamed", "late", "turned", "stuck", "missing", "damaged", "overtaking"
 ]
-CAPTURE_FAULTS: Final[tuple[CaptureFault, ...]] = get_args(CaptureFault)
 LATEST_S: Final = 2.0  # largest delay of motion capture
 
 

@@ -32,7 +32,6 @@ from bridges.crazyflie.protocol.crtp import Info
 from bridges.crazyflie.telemetry import BEARING, ELEVATION, Telemetry
 
 STALE_S: Final = 0.5  # the note reports poses older than this
-POLL_S: Final = 0.01
 WINDOW_S: Final = 0.25  # averaging window of the radio's load [s]
 MEASURING_S: Final = 8.0  # time in which a radio is measured: others may still start on it
 

@@ -27,7 +27,6 @@ from twins.arrays import Array, norm
 
 ENDLESS_M: Final = 1e6  # [m] walls that no robot meets
 WORK: Final = 2.2e5  # robot ticks that are flown, of 10 to 20 µs each: 310 s of seven robots, 2 s of a thousand
-FLIGHTS: Final = 2  # flights of a check: without noise, and with it
 SPEED_UP: Final = 15.0  # factor of the work that compiled functions fly: 33 s of a thousand
 STEPS_UP: Final = 3.0  # likewise, for laws with steps in Python
 REPETITIONS: Final = 5  # flights with noise, each with another seed

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import pathlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from inspect import getfile
@@ -16,7 +16,7 @@ from agents.body.kinds import KINDS
 from agents.plugins import files, registry
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
-from experiments.file.problems import Fault, Path
+from experiments.file.problems import Fault, Path, nodes
 
 # entry-point group of each choice of a plug-in; `int` is any number in a list, `str` any name
 _GROUPS: Final[Mapping[tuple[str | int | type, ...], str]] = {
@@ -145,19 +145,8 @@ def _numbers(value: Any) -> Any:  # noqa: ANN401 - a parameter of a plug-in
 
 def chosen(experiment: Experiment) -> list[tuple[str, str]]:
     """Group and name of every plug-in that an experiment chooses, kinds of robots and defaults aside."""
-    return [(group, registry.split(choice)[0]) for group, choice in _choices(tables(experiment), ())]
-
-
-def _choices(value: Any, path: Path) -> Iterator[tuple[str, Any]]:  # noqa: ANN401 - a document
-    group = group_of(path)
-    if group is not None and value is not None:
-        yield group, value
-    elif isinstance(value, dict):
-        for key, each in value.items():
-            yield from _choices(each, (*path, key))
-    elif isinstance(value, list | tuple):
-        for number, each in enumerate(value):
-            yield from _choices(each, (*path, number))
+    found = ((group_of(path), choice) for path, choice in nodes(tables(experiment)))
+    return [(group, registry.split(choice)[0]) for group, choice in found if group is not None]
 
 
 def plugin_files(plan: Plan) -> set[pathlib.Path]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import pathlib
 from base64 import b64encode
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any, Final, cast
 
 import msgspec
@@ -16,13 +16,14 @@ from agents.plugins.law import Law
 from experiments.catalogue import index
 from experiments.definition.experiment import TARGETS, Formation
 from experiments.definition.links import TARGET_KINDS, link_pairs, pairs_or_none
-from experiments.file.choices import struct_of
+from experiments.file.choices import group_of, struct_of
 from experiments.file.overrides import SHAPE
-from experiments.file.problems import Fault, Path
+from experiments.file.problems import Fault, Path, nodes
 
 ALONE: Final = "link"  # a link without a target
 LARGEST_FILE: Final = 1_000_000  # [bytes] largest file that an experiment names
 LOOKED_AT: Final = 100  # number of files beside an experiment, for the one that was meant
+_OWNERS: Final = ("formation", "timeline", "arena")  # tables with a choice of a law or a plan
 # files that stand beside the experiment in the folder of a run or of a sweep
 TAKEN_NAMES: Final = (
     "experiment.toml",
@@ -83,8 +84,10 @@ def fill_from_files(document: dict[str, Any], folder: pathlib.Path) -> tuple[lis
         What is wrong, and the content of each file by its name.
     """
     faults, contents = list[Fault](), dict[str, bytes]()
-    for table, key, path, group in _choices(document):
-        choice = table[key] = dict(table[key])
+    for path, choice in [*nodes({key: document[key] for key in _OWNERS if key in document})]:
+        group = group_of(path)
+        if group is None or not isinstance(choice, dict):
+            continue
         for parameter, content in named_files(choice, group).items():
             name = choice.get(parameter)
             if not isinstance(name, str) or not name:
@@ -124,20 +127,6 @@ def content_of(name: str, folder: pathlib.Path, path: Path, *, missing: bool = T
         message = f"{name} is longer than {LARGEST_FILE // 1_000_000} MB"
         return Fault(path, message, "take a smaller one: it goes with the experiment to every robot")
     return found
-
-
-def _choices(document: Mapping[str, Any]) -> Iterator[tuple[dict[Any, Any], Any, Path, str]]:
-    """Tables of chosen laws and plans: the table or list that holds each, its key there, its path and its group."""
-    formation, timeline, arena = (document.get(key) for key in ("formation", "timeline", "arena"))
-    obstacles = arena.get("obstacles") if isinstance(arena, dict) else None
-    holders: list[tuple[Any, str, Path, str]] = [(formation, "law", ("formation",), registry.LAWS)]
-    legs = timeline if isinstance(timeline, list) else []
-    holders += [(leg, "plan", ("timeline", number), registry.PLANNERS) for number, leg in enumerate(legs)]
-    things = obstacles.items() if isinstance(obstacles, dict) else ()
-    holders += [(each, "plan", ("arena", "obstacles", name), registry.PLANNERS) for name, each in things]
-    for table, key, path, group in holders:
-        if isinstance(table, dict) and isinstance(table.get(key), dict):
-            yield table, key, (*path, key), group
 
 
 def named_files(choice: object, group: str) -> Mapping[str, str]:

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import date, time
 from functools import cached_property
-from typing import Final
+from typing import Any, Final
 
 import msgspec
 
@@ -44,6 +44,14 @@ def places(text: str, *, json: bool = False) -> dict[Path, TextPosition]:
     else:
         scan.document()
     return scan.found
+
+
+def nodes(value: Any, path: Path = ()) -> Iterator[tuple[Path, Any]]:  # noqa: ANN401 - a document
+    """A document, or the part of it at `path`, and all that is in it, each with its path."""
+    yield path, value
+    inside = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list | tuple) else ()
+    for key, each in inside:
+        yield from nodes(each, (*path, key))
 
 
 def nearest(found: Mapping[Path, TextPosition], path: Path) -> tuple[Path, TextPosition]:

@@ -45,7 +45,7 @@ _FIELDS: Final = frozenset(Experiment.__struct_fields__)
 
 def faults(document: Mapping[str, Any], struct: type[msgspec.Struct] = Experiment) -> list[Fault]:
     """All faults of type, range and key; empty if `msgspec.convert` takes the document."""
-    found = _table(document, struct, ())
+    found = table_faults(document, struct, ())
     found = [*_strangers(document, found)]
     strayed = {f"'{fault.path[-1]}' is missing" for fault in found if "belongs at the top" in fault.hint}
     return [fault for fault in found if fault.path or fault.message not in strayed]
@@ -66,11 +66,6 @@ def _strangers(document: Mapping[str, Any], found: Sequence[Fault]) -> Iterator[
             yield fault
 
 
-def table_faults(table: Mapping[str, Any], struct: type[msgspec.Struct], path: Path) -> list[Fault]:
-    """As `faults`, of a table at a path of the document."""
-    return _table(table, struct, path)
-
-
 def _value(value: object, annotation: object, path: Path, note: str) -> list[Fault]:
     group = group_of(path)
     if group is not None and isinstance(value, str | dict):
@@ -78,7 +73,7 @@ def _value(value: object, annotation: object, path: Path, note: str) -> list[Fau
     plain, note = _plain(annotation, note)
     inner: list[Fault] = []
     if _is_struct(plain):
-        return _table(value, plain, path) if isinstance(value, dict) else [_no_table(value, path)]
+        return table_faults(value, plain, path) if isinstance(value, dict) else [_no_table(value, path)]
     if get_origin(plain) is dict:
         if not isinstance(value, dict):
             return [_no_table(value, path)]
@@ -100,7 +95,7 @@ def _value(value: object, annotation: object, path: Path, note: str) -> list[Fau
     return inner or _judged(value, annotation, path, note)
 
 
-def _table(
+def table_faults(
     value: Mapping[str, Any], struct: type[msgspec.Struct], path: Path, plugin: tuple[str, str] | None = None
 ) -> list[Fault]:
     """A table against a struct: unknown keys, missing keys, then each value, then the struct's own checks.
@@ -132,7 +127,7 @@ def _one_table(value: Mapping[str, Any], tables: Sequence[type[msgspec.Struct]],
     """A table against a struct, of several the one that its tag names."""
     field = tables[0].__struct_config__.tag_field
     if field is None:
-        return _table(value, tables[0], path)
+        return table_faults(value, tables[0], path)
     by_tag = {str(table.__struct_config__.tag): table for table in tables}
     tag = value.get(field)
     if tag not in by_tag:
@@ -141,7 +136,7 @@ def _one_table(value: Mapping[str, Any], tables: Sequence[type[msgspec.Struct]],
             return [Fault(path, f"'{field}' is missing{_place_in_file(path)}", f"add {field} = ...; known: {known}")]
         return [Fault((*path, field), f"'{field}' cannot be {shown(tag)}", did_you_mean(str(tag), by_tag))]
     fields = {key: each for key, each in value.items() if key != field}
-    return _table(fields, by_tag[str(tag)], path)
+    return table_faults(fields, by_tag[str(tag)], path)
 
 
 def _unknown(key: str, hint: str, path: Path, plugin: tuple[str, str] | None) -> Fault:
@@ -177,7 +172,7 @@ def _choice(value: str | dict[str, Any], group: str, path: Path) -> list[Fault]:
     except registry.PluginError as error:
         hint = "mend that file" if files.is_choice(kind) else "repair or uninstall it"
         return [Fault(where, str(error), f"{hint}, or choose another of the {what}")]
-    return _table(given, struct, path, (group, kind))
+    return table_faults(given, struct, path, (group, kind))
 
 
 def _kinds_with(group: str, keys: Sequence[str]) -> list[str]:

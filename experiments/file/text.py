@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import msgspec
 
-from experiments.file.problems import DocumentError, Fault, Problem, at_offset, key_name, refusal
+from experiments.file.problems import DocumentError, Fault, Problem, at_offset, key_name, nodes, refusal
 from experiments.file.problems import Path as Keys
 
 MAX_NUMBER: Final = 1e12  # largest number in any unit; squares and products of larger numbers are not finite for long
@@ -107,20 +107,15 @@ def parsed(text: str, label: str, *, json: bool) -> dict[str, Any]:
     return document
 
 
-def number_faults(value: object, path: Keys = ()) -> Iterator[Fault]:
+def number_faults(document: object, path: Keys = ()) -> Iterator[Fault]:
     """Faults of numbers that TOML can write and no experiment can hold."""
-    if isinstance(value, dict):
-        for key, each in value.items():
-            yield from number_faults(each, (*path, key))
-    elif isinstance(value, list):
-        for number, each in enumerate(value):
-            yield from number_faults(each, (*path, number))
-    elif isinstance(value, float) and not math.isfinite(value):
-        yield Fault(path, f"'{key_name(path)}' is {value}, which is no quantity", "give a finite number")
-    elif isinstance(value, float) and abs(value) > MAX_NUMBER:
-        yield Fault(path, f"'{key_name(path)}' is {value:g}, larger than anything here can be", "give a smaller number")
-    elif isinstance(value, int) and not -(2**63) <= value < 2**63:
-        yield Fault(path, f"'{key_name(path)}' has more digits than a 64-bit integer holds", "give a smaller number")
+    for at, value in nodes(document, path):
+        if isinstance(value, float) and not math.isfinite(value):
+            yield Fault(at, f"'{key_name(at)}' is {value}, which is no quantity", "give a finite number")
+        elif isinstance(value, float) and abs(value) > MAX_NUMBER:
+            yield Fault(at, f"'{key_name(at)}' is {value:g}, larger than anything here can be", "give a smaller number")
+        elif isinstance(value, int) and not -(2**63) <= value < 2**63:
+            yield Fault(at, f"'{key_name(at)}' has more digits than a 64-bit integer holds", "give a smaller number")
 
 
 def _toml_problem(text: str, label: str, message: str) -> Problem:

@@ -45,7 +45,6 @@ SAMPLES: Final = 24  # readings of a clock before a run
 DRIFT_SAMPLES: Final = 8  # readings of a clock in a run, with this period
 DRIFT_S: Final = 1.0  # NTP slews a clock by at most 500 ppm: 0.5 ms
 HANDSHAKES: Final = 6  # connections at once with one machine: sshd refuses some of more than ten (MaxStartups)
-POLL_S: Final = 0.02
 STATION: Final = "host@"  # prefix of the process of the connection to a host: no name of a case has this sign
 
 
@@ -239,7 +238,7 @@ class Station:
         self.ask(Question("register", lab=None if self.lab is None else self.folder, run=run))
 
     def start(self, name: str, robots: Sequence[str], document: bytes) -> Process:
-        wait_until(lambda: self._connecting() < HANDSHAKES, HELLO_S, POLL_S)
+        wait_until(lambda: self._connecting() < HANDSHAKES, HELLO_S)
         connect = [part for endpoint in self.endpoints for part in ("--connect", endpoint)]
         connect += [] if self.lab is None else ["--lab", self.folder]
         correction = f"{-self.applied:.6f}"
