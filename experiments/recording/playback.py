@@ -48,6 +48,7 @@ from experiments.recording.resample import HOLE_S, attitude, line, step, turn
 from experiments.recording.ros2.cdr import Undecodable, codec
 from experiments.recording.topics import JSON, KINDS_JSON, METADATA, TOPICS, SentGoal, SentPose, SpokenPose, Topic
 from experiments.recording.trace import (
+    ROUNDING_S,
     Goals,
     Trace,
     poses_in_run,
@@ -57,6 +58,8 @@ from twins.arrays import Array, Index
 
 HOLD_PERIODS: Final = 2.0  # state periods for which a sample is valid
 EARLY_S: Final = 0.5  # a landing at most this much before the planned end is a regular one [s]
+AROUND_S: Final = 600.0  # [s] longest time before and after a run that a replay shows
+PHASES: Final = {phase.word: int(phase) for phase in Phase}
 LANDED: Final = (Phase.LANDING.word, Phase.DONE.word)
 NOWHERE: Final = (math.nan, math.nan, math.nan)
 OPTIONAL: Final = ("attitude", "shadow_position", "shadow_yaw")  # columns that a trace may lack
@@ -140,6 +143,15 @@ class Playback:
     damaged: int  # what could not be read of the file [bytes]
 
 
+@dataclass(frozen=True)
+class WholeRecording:
+    """A recording from its first sample to its last."""
+
+    trace: Trace  # trace with take-off and landing; poses sent, contacts and reports of the world are those of the run
+    phase: Index  # (T, N) `agents.decision.lifecycle.Phase`
+    statuses: tuple[tuple[Status, ...], ...]  # statuses of each robot, stamps since the common start
+
+
 def read(path: Path) -> Playback:
     """Reads a recording.
 
@@ -170,18 +182,41 @@ def read(path: Path) -> Playback:
     """
     content = Content(Records(path))
     messages = content.fill()
-    records = content.records
-    about = AboutRun.of(records)
+    trace, start = _played(content, path)
+    return Playback(trace, start, content.records.complete, messages, content.records.damaged)
+
+
+def read_whole(path: Path) -> WholeRecording:
+    """Reads a recording for a replay, take-off and landing included; raises as `read`."""
+    content = Content(Records(path))
+    content.fill()
+    trace, start = _played(content, path, whole=True)
+    statuses = by_robot(content[Status], trace.robots)
+    phase = np.full(trace.yaw.shape, Phase.IDLE, dtype=np.intp)
+    for row, own in enumerate(by_robot(content[State], trace.robots)):
+        words = np.array([PHASES.get(state.phase, Phase.IDLE) for state in own], dtype=np.intp)
+        before = np.searchsorted([state.stamp - start for state in own], trace.time + ROUNDING_S, side="right")
+        phase[before > 0, row] = words[before[before > 0] - 1]
+    since = (tuple(replace(each, stamp=each.stamp - start) for each in own) for own in statuses)
+    return WholeRecording(trace, phase, tuple(since))
+
+
+def _played(content: Content, path: Path, *, whole: bool = False) -> tuple[Trace, float]:
+    """Trace of the run, or of the `whole` recording, and its common start [s, UTC]."""
+    about = AboutRun.of(content.records)
     plan = without_standby(about.plan, {state.robot for state in content[State]})
     about, experiment = dataclasses.replace(about, plan=plan), plan.experiment
     start = about.start(content[Event], content[Status], path)
     length, rate = content.length(start, experiment.duration_s), experiment.rates.state_hz
-    time = np.arange(math.floor(length * rate + 1e-9) + 1) / rate
+    begin, end = 0.0, length
+    if whole:
+        stamps = [at for state in content[State] if -AROUND_S < (at := state.stamp - start) < length + AROUND_S]
+        begin, end = min(stamps, default=0.0), max(stamps, default=0.0)
+    time = np.arange(math.floor(begin * rate + 1e-9), math.floor(end * rate + 1e-9) + 1) / rate
     if len(time) < 2:  # nothing can be integrated
         raise NotStarted(f"{path}: the run ended before the common start; there is nothing to show")
     with np.errstate(all="ignore"):  # numbers that no robot can have are in the file, not of our making
-        trace = _trace(content, about, (start, length), time)
-    return Playback(trace, start, records.complete, messages, records.damaged)
+        return _trace(content, about, (start, length), time), start
 
 
 class Content:

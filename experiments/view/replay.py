@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from math import inf, nan
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Final, TypeVar
@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 import numpy as np
 
 from agents.decision.lifecycle import Phase
-from agents.network.messages import Contact, LawMemory, Status, WorldState
+from agents.network.messages import Contact, Status, WorldState
 from experiments.metrics.clearance import Overlap
+from experiments.recording.playback import WholeRecording
 from experiments.recording.trace import ROUNDING_S
 from experiments.scene.drawing import SceneDrawing
 from experiments.scene.stage import (
@@ -29,16 +30,15 @@ from experiments.scene.stage import (
     drawn_errors,
     touched,
 )
-from experiments.scene.tracks import LOST_S, Track, Tracks
 from experiments.view.live import FRAME_S, IDLE_S, TABLE_S, Page
 from experiments.view.panel import HISTORY_S, PLOT_S, History, RobotRow, known, robot_row
-from twins.arrays import Array
+from twins.arrays import Array, Index
 
 if TYPE_CHECKING:
     import viser
 
-M = TypeVar("M", Contact, Status, WorldState, LawMemory)
-NOTHING: Final = LawMemory("", 0, 0.0)
+M = TypeVar("M", Contact, Status, WorldState)
+LOST_S: Final = 1.0  # time without a sample after which a robot is silent
 SPEEDS: Final = ("0.1", "0.25", "0.5", "1", "2", "5", "10", "20")
 STEP_S: Final = 0.02  # length of a single step: a sample at 50 Hz
 APART: Final = 0.15  # distance of words on the slider, in its lengths
@@ -48,86 +48,120 @@ GAP: Final = 1.15  # distance from arena to arena, in its lengths
 class Film:
     """A recorded case as moments."""
 
-    def __init__(self, tracks: Tracks) -> None:
-        self.tracks, self.stage = tracks, SceneModel.of_plan(tracks.plan)
+    def __init__(self, recording: WholeRecording) -> None:
+        self.recording, self.trace = recording, recording.trace
+        self.stage = SceneModel.of_plan(self.trace.plan)
         self.links = LinkTracker(self.stage)
+        time, place = self.trace.time, self.trace.true_position
+        self.begin, self.end = float(time[0]), float(time[-1])
+        rows = np.arange(len(time))[:, None]
+        known = np.where(np.isfinite(place).all(axis=2), rows, -1)
+        self._newest: Index = np.maximum.accumulate(known, axis=0)  # (T, N) last sample with a position; −1: none yet
+        held = np.take_along_axis(place, np.maximum(self._newest, 0)[..., None], axis=0)
+        self._place: Array = np.where(self._newest[..., None] < 0, nan, held)  # silent robots stay where they were
+        self._sent: list[Array] = [np.sort(self.trace.sent_by(row).stamp) for row in range(len(self.trace.robots))]
         self._ages: Array = TRAIL_S * np.arange(TRAIL, dtype=np.float64)
+
+    def positions(self, times: Array) -> Array:
+        """Positions (..., N, 3) [m] at `times` (...) [s], interpolated; unknown before the first sample."""
+        time = self.trace.time
+        at = np.interp(times, time, np.arange(len(time)), left=nan)
+        low = np.nan_to_num(at).astype(np.intp)
+        share = (at - low)[..., None, None]
+        before, after = self._place[low], self._place[np.minimum(low + 1, len(time) - 1)]
+        return np.where(share == 0.0, before, before + share * (after - before))
 
     def moment(self, t: float) -> Moment:
         """The case at `t` [s] since the common start: between two samples, positions are interpolated."""
-        tracks = self.tracks.tracks
-        at, world = [track.at(t) for track in tracks], _last_status(self.tracks.world, t)
-        trail = np.stack([track.positions(t - self._ages) for track in tracks])
+        trace, world = self.trace, _last_status(self.trace.world, t)
+        sample = int(np.searchsorted(trace.time, t + ROUNDING_S, side="right")) - 1
+        trail = self.positions(t - self._ages).swapaxes(0, 1)
         position = trail[:, 0]
         obstacles = self.stage.obstacles_at(t, world)
         overlaps = [
             *self.stage.overlaps(position, obstacles, world),
-            *(Overlap(each.first, each.second, each.overlap) for each in _lately(self.tracks.contacts, t, TOUCH_S)),
+            *(Overlap(each.first, each.second, each.overlap) for each in _lately(trace.contacts or (), t, TOUCH_S)),
         ]
         touching = {name for each in overlaps for name in (each.first, each.second)}
-        each_at = zip(self.tracks.robots, tracks, at, strict=True)
         conditions = np.array(
-            [_condition(track, k, t, touches=name in touching) for name, track, k in each_at], dtype=np.intp
+            [self._condition(row, sample, t, touches=name in touching) for row, name in enumerate(trace.robots)],
+            dtype=np.intp,
         )
-        goal = _taken(tracks, at, "goal", 3)
-        memories = [_last_status(track.memories, t) or NOTHING for track in tracks]
+        goal = self._taken(trace.goal, sample)
         goal[np.isin(conditions, AT_REST)] = nan
+        shadow_yaw = None if trace.shadow_yaw is None else self._taken(trace.shadow_yaw, sample)
         return Moment(
             position=position,
-            yaw=_taken(tracks, at, "yaw", 1)[:, 0],
+            yaw=self._taken(trace.yaw, sample),
             goal=goal,
             condition=conditions,
-            silent_for=np.array([_time_since(track.sent, t) for track in tracks]),
+            silent_for=np.array([_time_since(sent, t) for sent in self._sent]),
             error=self.links.errors(t, position),
-            broken=self.stage.broken_links(conditions, [_last_status(track.statuses, t) for track in tracks]),
+            broken=self.stage.broken_links(conditions, self._statuses(t)),
             obstacles=obstacles,
             trail=trail,
-            attitude=_taken(tracks, at, "attitude", 4),
-            shadow=_taken(tracks, at, "shadow", 3),
-            shadow_yaw=_taken(tracks, at, "shadow_yaw", 1)[:, 0],
+            attitude=None if trace.attitude is None else self._taken(trace.attitude, sample),
+            shadow=None if trace.shadow_position is None else self._taken(trace.shadow_position, sample),
+            shadow_yaw=shadow_yaw,
             time=t,
-            places=self.stage.said_places([each.variables for each in memories], position),
-            measures=[each.numbers for each in memories],
+            places=self.stage.said_places(self._remembered(trace.memory, sample), position),
+            measures=self._remembered(trace.measures, sample),
             overlaps=overlaps,
         )
 
     def rows(self, t: float) -> list[RobotRow]:
         """The table at `t` [s]."""
-        moment = self.moment(t)
+        moment, statuses = self.moment(t), self._statuses(t)
         errors = self.links.of_robots(moment.error)
-        ticks = self.tracks.clock == "real"  # virtual time misses none
+        ticks = self.trace.clock == "real"  # virtual time misses none
         rows = []
-        for k, (name, track) in enumerate(zip(self.tracks.robots, self.tracks.tracks, strict=True)):
-            condition, status = Condition(int(moment.condition[k])), _last_status(track.statuses, t)
-            rate = float(np.subtract(*np.searchsorted(track.sent, (t, t - 1.0), side="right")))
-            touches = touched(name, moment.overlaps)
-            row = robot_row(name, condition, status, known(errors[k]), rate, ticks=ticks, touches=touches)
+        for k, name in enumerate(self.trace.robots):
+            rate = float(np.subtract(*np.searchsorted(self._sent[k], (t, t - 1.0), side="right")))
+            condition, touches = Condition(int(moment.condition[k])), touched(name, moment.overlaps)
+            row = robot_row(name, condition, statuses[k], known(errors[k]), rate, ticks=ticks, touches=touches)
             rows.append(row.measured(moment.measures, k))
         return rows
 
     def history(self) -> History:
         """Errors and rates of the whole case, four times a second."""
-        tracks, stage = self.tracks, self.stage
+        stage = self.stage
         history = History(len(stage.names))
-        grid = np.arange(tracks.begin, tracks.end, PLOT_S)
-        position = np.stack([track.positions(grid) for track in tracks.tracks], axis=1)
+        grid = np.arange(self.begin, self.end, PLOT_S)
         error = np.zeros((len(grid), len(stage.links)))
         if stage.plan is not None and len(stage.links):
-            error = np.nan_to_num(drawn_errors(stage.plan, grid, position), posinf=np.inf)
-        sent = [np.searchsorted(each.sent, grid) - np.searchsorted(each.sent, grid - 1.0) for each in tracks.tracks]
+            error = np.nan_to_num(drawn_errors(stage.plan, grid, self.positions(grid)), posinf=np.inf)
+        sent = [np.searchsorted(each, grid) - np.searchsorted(each, grid - 1.0) for each in self._sent]
         history.time = grid.tolist()
         history.error = [self.links.of_robots(each) for each in error]
         history.rate = list(np.stack(sent, axis=1).astype(float))
         return history
 
+    def _condition(self, row: int, sample: int, t: float, *, touches: bool) -> Condition:
+        """Condition of a robot by its sample and its last status."""
+        newest = -1 if sample < 0 else self._newest[sample, row]
+        if newest < 0:
+            return Condition.WAITING
+        silent, last = t - self.trace.time[newest] > LOST_S, newest == self._newest[-1, row]
+        phase = Phase(int(self.recording.phase[sample, row])).word
+        alive = not (silent and last)
+        return condition(self._statuses(t)[row], phase, alive=alive, silent=silent, touches=touches)
 
-def _condition(track: Track, sample: int, t: float, *, touches: bool) -> Condition:
-    """Condition of a robot by its sample and its last status."""
-    if sample < 0:
-        return Condition.WAITING
-    silent, last = t - track.time[sample] > LOST_S, sample == len(track.time) - 1
-    phase, status = Phase(int(track.phase[sample])).word, _last_status(track.statuses, t)
-    return condition(status, phase, alive=not (silent and last), silent=silent, touches=touches)
+    def _statuses(self, t: float) -> list[Status | None]:
+        """Last status of each robot."""
+        return [_last_status(own, t) for own in self.recording.statuses]
+
+    @staticmethod
+    def _taken(values: Array, sample: int) -> Array:
+        """Row of a column (T, N, ...) at a sample; unknown before the first."""
+        return values[sample].copy() if sample >= 0 else np.full(values.shape[1:], nan)
+
+    def _remembered(self, columns: Mapping[str, Array], sample: int) -> list[dict[str, Any]]:
+        """Known values of each robot's law at a sample, by name."""
+        found: list[dict[str, Any]] = [{} for _ in self.trace.robots]
+        for name, values in columns.items() if sample >= 0 else ():
+            for row in np.flatnonzero(np.isfinite(values[sample]).reshape(len(found), -1).all(axis=1)).tolist():
+                found[row][name] = values[sample, row].tolist()
+        return found
 
 
 def _last_status(messages: Sequence[M], t: float) -> M | None:
@@ -146,13 +180,6 @@ def _time_since(sent: Array, t: float) -> float:
     """Time since the last of some events at or before `t` [s]."""
     k = int(np.searchsorted(sent, t + ROUNDING_S, side="right"))
     return t - float(sent[k - 1]) if k else inf
-
-
-def _taken(tracks: Sequence[Track], at: Sequence[int], name: str, width: int) -> Array:
-    """A column of the samples `at` (N, width); unknown before the first."""
-    blank = np.full(width, nan)
-    rows = [np.atleast_1d(getattr(track, name)[k]) if k >= 0 else blank for track, k in zip(tracks, at, strict=True)]
-    return np.array(rows, dtype=float).reshape(-1, width)
 
 
 class ReplayClock:
@@ -207,7 +234,7 @@ class ReplayView:
         """Draws all cases beside one another; `where` says which run it is."""
         self._server, self._films = server, list(films)
         self._where = where
-        self.clock = ReplayClock(min(film.tracks.begin for film in films), max(film.tracks.end for film in films))
+        self.clock = ReplayClock(min(film.begin for film in films), max(film.end for film in films))
         self._drawn: object = None
         self._tabled = -inf
         self._build_controls()
@@ -223,7 +250,7 @@ class ReplayView:
                 page.fit(film.stage)
                 drawing.shown = page.shown
                 if len(films) > 1:
-                    drawing.name(film.tracks.case)
+                    drawing.name(film.trace.case)
                 self._drawings.append(drawing)
         largest = np.max(sizes, axis=0)
         page.camera.show(largest + np.array([pitch * (len(films) - 1), 0.0, 0.0]))
@@ -251,7 +278,7 @@ class ReplayView:
         self._drawn = (t, shown, self.clock.playing)
         with self._server.atomic():
             for film, drawing in zip(self._films, self._drawings, strict=True):
-                drawing.draw(film.moment(min(t, film.tracks.end)), still=not self.clock.playing)
+                drawing.draw(film.moment(min(t, film.end)), still=not self.clock.playing)
         now = time.monotonic()
         if not self.clock.playing or now - self._tabled >= TABLE_S:
             self._tabled = now
@@ -268,7 +295,7 @@ class ReplayView:
             )  # fmt: skip
             add_transport(self._server, clock, ("-1 s", "-1", "+1", "+1 s"))
             if len(self._films) > 1:
-                case = gui.add_dropdown("table of", tuple(film.tracks.case for film in self._films))
+                case = gui.add_dropdown("table of", tuple(film.trace.case for film in self._films))
                 case.on_update(self._choose_case)
         self._slider.on_update(self._seek)
 
@@ -278,7 +305,7 @@ class ReplayView:
             self.clock.seek(float(event.target.value))
 
     def _choose_case(self, event: viser.GuiEvent[Any]) -> None:
-        self._choose([film.tracks.case for film in self._films].index(event.target.value))
+        self._choose([film.trace.case for film in self._films].index(event.target.value))
 
     def _choose(self, number: int) -> None:
         """Shows table and plots of one case."""
@@ -289,13 +316,13 @@ class ReplayView:
     def _tabulate(self, t: float) -> None:
         film, history = self._films[self._shown], self._histories[self._shown]
         panel = self._page.panel
-        tracks = film.tracks
+        trace = film.trace
         if abs(self._slider.value - t) > 0.5 * STEP_S:
             self._slider.value = round(t, 2)
-        said = [event for event in tracks.events if event.stamp <= t]
+        said = [event for event in trace.events if event.stamp <= t]
         phase = next((event.text for event in reversed(said) if event.kind == "phase"), "")
-        panel.show_head(tracks.case, phase, t, tracks.plan.experiment.duration_s, self._where)
-        at = min(t, tracks.end)
+        panel.show_head(trace.case, phase, t, trace.plan.experiment.duration_s, self._where)
+        at = min(t, film.end)
         panel.show_tables(film.rows(at), film.moment(at).error, said, 0.0)
         first, last = np.searchsorted(history.time, (t - HISTORY_S, t))
         first = min(int(first), int(last) - 2)
@@ -308,11 +335,11 @@ class ReplayView:
 
 def marks(films: Sequence[Film]) -> tuple[Any, ...]:
     """Events on the slider: phases of the first case with their words, incidents of all as points."""
-    worded = [(event.stamp, event.text) for event in films[0].tracks.events if event.kind == "phase"]
-    begin, end = min(film.tracks.begin for film in films), max(film.tracks.end for film in films)
+    worded = [(event.stamp, event.text) for event in films[0].trace.events if event.kind == "phase"]
+    begin, end = min(film.begin for film in films), max(film.end for film in films)
     found: dict[float, Any] = {}
     for film in films:
-        for event in film.tracks.events:
+        for event in film.trace.events:
             if event.kind in ("hazard", "lost", "failed", "stop", "order", "contact") and begin <= event.stamp <= end:
                 found[round(event.stamp, 1)] = round(event.stamp, 2)
     last = -inf

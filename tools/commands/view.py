@@ -303,12 +303,12 @@ def _of_run(run: RegisteredRun, identity: str | None) -> WatchedRun:
 
 
 def _replay(folder: Path, ended: threading.Event, *, port: int, dark: bool, open_page: bool) -> int:
-    from experiments.scene import tracks
+    from experiments.recording.playback import read_whole
     from experiments.view import replay as replaying
     from experiments.view.serving import served
 
     files = _recordings(folder)
-    films = [replaying.Film(tracks.read(file)) for file in files]
+    films = [replaying.Film(read_whole(file)) for file in files]
     with served(port, dark=dark) as server:
         page = replaying.ReplayView(server, films, str(folder), dark=dark)
         _tell(server, f"{folder}; Ctrl-C ends it", open_page=open_page)

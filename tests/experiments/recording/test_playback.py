@@ -16,10 +16,9 @@ from experiments.definition.experiment import Formation, Rates, RobotTable
 from experiments.metrics.measure import measure
 from experiments.recording.clocks import ClockSample, Correction, host_offset
 from experiments.recording.losses import count_in_run
-from experiments.recording.playback import NotStarted, read
+from experiments.recording.playback import NotStarted, read, read_whole
 from experiments.recording.reader import RecordingError, recover
 from experiments.run import reopen
-from experiments.scene import tracks
 from tests.experiments import recordings as rec
 
 GRID = np.arange(11) / 10
@@ -333,7 +332,7 @@ def test_a_file_without_an_experiment(path, metadata, attachment):
         read(path)
 
 
-@pytest.mark.parametrize("read", [read, tracks.read])
+@pytest.mark.parametrize("read", [read, read_whole])
 def test_a_file_of_another_version(path, read):
     foreign(path, ("/TB01/state", "zenpark_msgs/msg/State", b"string robot\n", b"\0\1\0\0"))
     with pytest.raises(RecordingError, match=r"/TB01/state was recorded by a version of zenpark with other fields"):

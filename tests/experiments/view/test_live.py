@@ -20,9 +20,10 @@ from agents.network.keys import Keys
 from experiments.file import document
 from experiments.file.document import load
 from experiments.real_time.hosts.run_registry import RegisteredRun
+from experiments.recording.playback import read_whole
 from experiments.recording.reader import RecordingError
 from experiments.run import simulate, simulate_seeds
-from experiments.scene import models, tracks
+from experiments.scene import models
 from experiments.scene.stage import BAD, FAIR, PALED, RINGED, Condition, SceneModel, condition, touched
 from experiments.view import live
 from experiments.view.acting import WatchedRun, may_act
@@ -252,12 +253,12 @@ def recorded_case(request):
 
 @pytest.fixture
 def film(recorded_case):
-    return Film(tracks.read(recorded_case[1]))
+    return Film(read_whole(recorded_case[1]))
 
 
 def test_replay_shows_contacts_that_a_world_reported(film):
     contact = messages.Contact(1.0, "KH01", "box", 0.1, 0.002)
-    touched = Film(replace(film.tracks, contacts=(contact,)))
+    touched = Film(replace(film.recording, trace=replace(film.trace, contacts=(contact,))))
     for t, note in ((0.9, ""), (1.5, "touches box, 0.2 cm deep"), (2.1, "")):
         assert next(row.note for row in touched.rows(t) if row.name == "KH01") == note
 
@@ -276,7 +277,7 @@ def test_reason_of_an_early_end_stays(film):
 @pytest.mark.slow
 def test_positions_are_those_of_the_recording(recorded_case, film):
     trace, _ = recorded_case
-    assert film.tracks.robots == trace.robots
+    assert film.trace.robots == trace.robots
     for k in range(0, len(trace.time), 17):
         moment = film.moment(float(trace.time[k]))
         assert np.cos(moment.yaw - trace.yaw[k]) == pytest.approx(1.0, abs=1e-3)
@@ -285,25 +286,28 @@ def test_positions_are_those_of_the_recording(recorded_case, film):
     between = float(trace.time[20] + trace.time[21]) / 2
     middle = (trace.true_position[20] + trace.true_position[21]) / 2
     assert film.moment(between).position == pytest.approx(middle, abs=1e-6)
-    for row, track in enumerate(film.tracks.tracks):
-        sent = track.sent[(track.sent >= -1e-6) & (track.sent < 3.0 - 1e-6)]
-        assert sent == pytest.approx(np.sort(trace.sent_by(row).stamp), abs=1e-5)
+    lost = replace(
+        film.trace, true_position=np.where(film.trace.time[:, None, None] > 1.0, np.nan, film.trace.true_position)
+    )
+    silent = Film(replace(film.recording, trace=lost)).moment(2.5)
+    assert silent.position == pytest.approx(film.moment(1.0).position, abs=1e-6)  # where they were last
+    assert set(silent.condition.tolist()) == {Condition.DEAD}
 
 
 def test_truncated_recording_is_replayed_to_its_end(recorded_case, tmp_path):
     _, file = recorded_case
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(file.read_bytes()[: int(0.7 * file.stat().st_size)])
-    assert 0.0 < tracks.read(cut).end < tracks.read(file).end
+    assert 0.0 < Film(read_whole(cut)).end < Film(read_whole(file)).end
     cut.write_bytes(b"nothing")
     with pytest.raises(RecordingError, match="not an MCAP file"):
-        tracks.read(cut)
+        read_whole(cut)
 
 
 def test_conditions_and_errors_follow_the_phases(film):
     assert (film.moment(1.0).condition == Condition.ACTIVE).all()
-    assert (film.moment(film.tracks.begin - 1.0).condition == Condition.WAITING).all()
-    assert set(film.moment(film.tracks.end).condition.tolist()) <= {Condition.LANDING, Condition.DONE}
+    assert (film.moment(film.begin - 1.0).condition == Condition.WAITING).all()
+    assert set(film.moment(film.end).condition.tolist()) <= {Condition.LANDING, Condition.DONE}
     assert "landing" in [mark[1] for mark in marks([film]) if isinstance(mark, tuple)]
     history = film.history()
     k = int(np.searchsorted(history.time, 2.0))
@@ -330,13 +334,13 @@ def test_the_clock_plays_pauses_and_ends():
 
 
 def test_table_has_recorded_content_and_no_empty_columns(film):
-    read = film.tracks
-    assert {(row.battery, row.missed) for t in (0.0, read.end) for row in film.rows(t)} == {(None, None)}
-    text = table(film.rows(read.end), film.stage)
+    assert {(row.battery, row.missed) for t in (0.0, film.end) for row in film.rows(t)} == {(None, None)}
+    text = table(film.rows(film.end), film.stage)
     assert [word for word in ("f [Hz]", "battery", "missed", "delay", "nan", "None") if word in text] == ["f [Hz]"]
-    status = msgspec.structs.replace(read.tracks[0].statuses[0], stamp=1.0, battery=0.8, missed=3)
-    told = (replace(read.tracks[0], statuses=(status,)), *read.tracks[1:])
-    real = Film(replace(read, clock="real", tracks=told))
+    first, *others = film.recording.statuses
+    status = msgspec.structs.replace(first[0], stamp=1.0, battery=0.8, missed=3)
+    trace = replace(film.trace, clock="real")
+    real = Film(replace(film.recording, trace=trace, statuses=((status,), *others)))
     rows = [*real.rows(1.5)[:2], real.rows(0.5)[0]]
     assert [(row.battery, row.missed) for row in rows] == [(0.8, 3), (None, None), (None, None)]
     text = table(real.rows(1.5), real.stage)
@@ -377,7 +381,7 @@ def test_warnings_misses_and_leaders_look_so(film):
 
 def test_said_places_are_those_of_the_memory():
     run = recorded("aggregative", "duration_s=3.0", cases=("event",))
-    trace, film = run.traces["event"], Film(tracks.read(run.folder / "event.mcap"))
+    trace, film = run.traces["event"], Film(read_whole(run.folder / "event.mcap"))
     assert dict(film.stage.place_variables) == {"s": 0}
     for k in range(5, len(trace.time), 31):
         moment = film.moment(float(trace.time[k]))
