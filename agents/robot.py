@@ -24,6 +24,7 @@ from agents.decision.position_control import PositionController, VelocityFollowe
 from agents.decision.situation import ProcessHealth, Situation
 from agents.decision.stepping import Stepping, Words
 from agents.decision.transmission import Transmitter
+from agents.plugins.law import View
 from agents.plugins.predictors import HOLD
 from agents.safety.detection import Detector, RobotStatus
 from agents.safety.hazards import Cause, Hazards, Outcome
@@ -200,6 +201,11 @@ class Robot:
         """The law at work, if it is no gradient; that of a guided robot is at work in its central controller."""
         return self._stepping if self.guidance is None else None
 
+    def view(self, t: float) -> View:
+        """View of the law for its step at `t` [s], between the halves of a tick; of a law that steps, once a tick."""
+        now = self.now
+        return self.goals.view(t, now.position, now.velocity, now.yaw, self.lifecycle.start_at)
+
     def missing_neighbours(self) -> list[str]:
         """Neighbours that the robot has never received, or that are lost; likewise its central controller."""
         names, guidance = self.neighbours.missing(), self.guidance
@@ -290,6 +296,8 @@ class Robot:
             t, now.position, now.velocity, self.error, goals.energy, max(t - self.lifecycle.start_at, 0.0),
             goals.offset, self.setpoint,
         )  # fmt: skip
+        if self._stepping is not None:
+            self._stepping.deviation = 0.0 if due else transmitter.asking.view.deviation
         self.sent_position, self.sent_velocity = transmitter.position, transmitter.velocity
         if self._predicts:
             due = self._stands_blind() or due

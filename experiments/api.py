@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from agents.plugins.planners import Planner
     from agents.plugins.predictors import Predictor
     from agents.plugins.registry import PluginError
-    from agents.plugins.triggers import Trigger
+    from agents.plugins.triggers import Trigger, TriggerView
     from agents.vectors import NotNegative, Positive, Vector, clamp, difference, distance, norm, wrap
     from experiments.check.check import check, figures
     from experiments.definition import formation, graph, rigidity
@@ -65,7 +65,7 @@ __all__ = [  # noqa: RUF022 - by subject, as in docs/python.md
     "View", "NeighbourView", "Memory", "Values", "is_known", "Measure", "RobotFacts", "Severity", "Link", "PluginError",
     "Measurement", "Array", "Positive", "NotNegative",
     # other bases of plug-ins
-    "Predictor", "Avoidance", "measure_gap", "EngineFactory", "PointMassEngine", "moving_models",
+    "TriggerView", "Predictor", "Avoidance", "measure_gap", "EngineFactory", "PointMassEngine", "moving_models",
     # kinds and bodies
     "Kind", "KINDS", "Wheels", "Steered", "Holonomic", "Flight", "Ground",
     "Body", "BodyRequest", "BodyState", "BodyError", "BodyEntry", "BodyFault", "call_all",

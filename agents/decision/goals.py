@@ -185,13 +185,13 @@ class GoalComputer:
         if self.changes_shape:
             self.reshape(t - start, position, t)
         if self.stepping is not None:
-            self.stepping.step(self._view(t, position, velocity, yaw, start))
+            self.stepping.step(self.view(t, position, velocity, yaw, start))
 
     def is_sound(self, t: float, position: Vector) -> bool:
         """Whether the law, asked at `t` [s] for a robot that stands at `position` [m], wants what is finite."""
         if self.stepping is None:
             return is_finite(self.law_offset(t, position))
-        return is_sound(self.stepping.rehearse(self._view(t, position, ZERO, 0.0, t)))
+        return is_sound(self.stepping.rehearse(self.view(t, position, ZERO, 0.0, t)))
 
     def unknown_reads(self, t: float, position: Vector) -> str:
         """Words on what the law reads although it is unknown; empty without. In flight, too: it changes nothing."""
@@ -209,7 +209,8 @@ class GoalComputer:
             ],
         )
 
-    def _view(self, t: float, position: Vector, velocity: Vector, yaw: float, start: float) -> View:
+    def view(self, t: float, position: Vector, velocity: Vector, yaw: float, start: float) -> View:
+        """View of a law that is no gradient; for the arguments see `decide`."""
         view = self._sight(t, position, velocity, yaw)
         if self.itinerary is not None:
             x, y, z, _ = self.itinerary.target(t - start, (position[0], position[1], self.ground), yaw)

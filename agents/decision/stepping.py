@@ -103,6 +103,7 @@ class Stepping:
         self.measures: dict[str, float] = {}  # likewise
         self.moves = True  # the robot may move; set by its caller, and likewise
         self.scan: Any = None  # range readings
+        self.deviation = nan  # of what the neighbours believe [m]
         self.tick, self._stepped = 0, -1  # number of the tick since the common start
         self._target = UNKNOWN
 
@@ -150,6 +151,7 @@ class Stepping:
         view = View(self.facts, {} if self.speech is None else self.speech.said, ())
         view.time = self.tick * self.tick_s
         view.moves, view.scan = self.moves, self.scan
+        view.deviation = self.deviation
         if self._stepped >= 0:
             passed = (self.tick - self._stepped) * self.tick_s
             view.step_s = min(max(passed, self.tick_s), MOST_STEPS * self.facts.step_s)

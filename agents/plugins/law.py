@@ -94,6 +94,7 @@ class View:
     target: Vector = UNKNOWN  # place of the robot's plan now [m]; NaN without one
     target_velocity: Vector = ZERO  # velocity of that target [m/s]; 0 at first
     scan: Any = None  # range readings, see `agents.body.interface.RangeScan`; None without
+    deviation: float = nan  # distance of what the neighbours believe from the truth [m]; NaN where it is unknown
     leads: bool = False  # the law does not move it: it has no links, and follows a plan or stays
     moves: bool = True  # False while safety holds it: integrals of what its motion must mend stop then
 

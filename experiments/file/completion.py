@@ -23,7 +23,7 @@ from experiments.file.problems import Fault, Path, nodes
 ALONE: Final = "link"  # a link without a target
 LARGEST_FILE: Final = 1_000_000  # [bytes] largest file that an experiment names
 LOOKED_AT: Final = 100  # number of files beside an experiment, for the one that was meant
-_OWNERS: Final = ("formation", "timeline", "arena")  # tables with a choice of a law or a plan
+_OWNERS: Final = ("trigger", "formation", "timeline", "arena")  # tables with a choice of a plug-in
 # files that stand beside the experiment in the folder of a run or of a sweep
 TAKEN_NAMES: Final = (
     "experiment.toml",
@@ -76,7 +76,7 @@ def fill_from_shape(document: dict[str, Any]) -> list[Fault]:
 
 
 def fill_from_files(document: dict[str, Any], folder: pathlib.Path) -> tuple[list[Fault], dict[str, bytes]]:
-    """Gives law and plans, in place, the content of the files that they name, which are in `folder` or the catalogue.
+    """Gives choices, in place, the content of the files that they name, which are in `folder` or the catalogue.
 
     Without such a file a choice keeps the content that it has: the experiment comes from where the file was.
 

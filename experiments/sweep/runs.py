@@ -106,10 +106,10 @@ def digest(plan: Plan) -> str:
 def code_of(plan: Plan) -> str:
     """Digest of everything that determines the result: our code, modules of plug-ins and metrics, library versions.
 
-    The libraries are numpy, that of the engine, which has its name, and that of the law. Of a plug-in only its own
-    module counts, not other modules that it imports.
+    The libraries are numpy, that of the engine, which has its name, and that of the law or the trigger. Of a plug-in
+    only its own module counts, not other modules that it imports.
     """
-    files, library = plugin_files(plan), plan.law.LIBRARY
+    files, library = plugin_files(plan), plan.law.LIBRARY or plan.trigger.LIBRARY
     engine = plan.engine_name
     libraries = [engine, *engine_versions(engine), *(engine_versions(library) if library else [])]
     others = sorted(file_digest(file) for file in files if file.parent.parent != ROOT)

@@ -15,6 +15,7 @@ import numpy as np
 
 from agents.body.interface import BodyState
 from agents.body.shadow_twin import shadowed
+from agents.decision.assignment import Assignment
 from agents.plugins.calls import explain, supervised
 from agents.plugins.registry import FAILURES
 from agents.robot import Robot
@@ -23,7 +24,7 @@ from experiments.arrays import PoseTable
 from experiments.definition.bodies import body_request, shadow_periods, shared_world
 from experiments.definition.plan import Plan
 from experiments.virtual_time.company import AT_END, AT_HAZARDS, LEAN, PLACES, WIDTH, Ledger
-from experiments.virtual_time.conductor import PATIENCE_S, VirtualConductor
+from experiments.virtual_time.conductor import PATIENCE_S, Stuck, VirtualConductor
 from experiments.virtual_time.network import CentreLog, VirtualNetwork
 from experiments.virtual_time.steps import Steps
 from experiments.virtual_time.stretch import Stretches, stretches_of
@@ -128,10 +129,25 @@ def simulate(
 class VirtualRun:
     """A run in virtual time."""
 
-    def __init__(self, plan: Plan, seed: int, *, quiet: bool, lean: bool, patience_s: float = PATIENCE_S) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        seed: int,
+        *,
+        quiet: bool = False,
+        lean: bool = False,
+        patience_s: float = PATIENCE_S,
+        assignments: Mapping[str, Assignment] | None = None,
+    ) -> None:
+        """Set up a run; for the arguments see `simulate`.
+
+        Args:
+            assignments: By the names of robots, of those with a law or a trigger other than the file's.
+        """
         self.plan, self._seed, self.lean = plan, seed, lean
         self.names = names = plan.names
-        self.robots = [Robot(plan.assignment(name)) for name in names]
+        others = assignments or {}
+        self.robots = [Robot(others.get(name) or plan.assignment(name)) for name in names]
         request = body_request(plan, names, seed, quiet=quiet)
         request = replace(request, external=(False,) * len(names))  # no motion capture in virtual time
         self.twin = TwinBody(request, shared_world(plan, names))
@@ -153,7 +169,7 @@ class VirtualRun:
         self.stretches: Stretches | None = None  # compiled ones, where they pay
         self._samples: list[dict[str, Any]] = []
         self._columns: dict[str, list[Array]] = {}
-        self._touches: list[Touch] = []
+        self.touches: list[Touch] = []  # contacts that began so far
         self._memory, self._measures = LawColumns(), LawColumns()
 
     def fly(
@@ -168,32 +184,70 @@ class VirtualRun:
             if stretches is not None and not self.network.retired:
                 self._tick, reason = stretches.fly(self._tick, conductor.next_order(self._tick, dt))
             t = self._tick * dt
-            self.step(t, reason)
+            self._step(t, reason)
             if (first.tick - 1) % self.log_every == 0:  # the robots' count restarts at the common start
                 progress(t - conductor.start_at)
                 if watch is not None:
-                    watch(Snapshot(t - conductor.start_at, t, self.robots, self._states, self.twin.engine))
+                    watch(self.snapshot(t))
                 self._sample(t)
             if not landing and t - conductor.start_at >= self.plan.experiment.duration_s - 0.5 * dt:
                 return
-            conductor.give_orders(t, dt)
-            self.twin.begun_at = conductor.start_at
-            self._tick += 1
+            self._end_tick(t)
 
-    def step(self, t: float, reason: int = AT_END) -> None:
+    def begin(self) -> float:
+        """Fly to the common start; returns its time [s]. There all robots have observed, and `decide` comes next.
+
+        Raises Stuck if robots do not become ready or airborne, or end before.
+        """
+        while not self._conductor.over:
+            t = self._tick * self.dt
+            self.observe(t)
+            if any(robot.begun for robot in self.robots):
+                return t
+            self.decide(t)
+        raise Stuck(f"no robot begins: {self.robots[0].lifecycle.reason}")
+
+    def observe(self, t: float) -> None:
+        """First half of the tick at `t` [s]: bodies are read, poses received and sent, hazards detected."""
+        self._receive(t)
+        self._detect(t)
+
+    def decide(self, t: float) -> None:
+        """Second half of the tick at `t` [s]: goals, setpoints and commands, then the orders of the conductor."""
+        self._act(t)
+        self._end_tick(t)
+
+    def snapshot(self, t: float) -> Snapshot:
+        """State of the run at `t` [s]."""
+        return Snapshot(t - self._conductor.start_at, t, self.robots, self._states, self.twin.engine)
+
+    def _end_tick(self, t: float) -> None:
+        self._conductor.give_orders(t, self.dt)
+        self.twin.begun_at = self._conductor.start_at
+        self._tick += 1
+
+    def _step(self, t: float, reason: int) -> None:
         """One tick at `t` [s], or the rest of one that a compiled stretch has begun, for this `reason`."""
-        robots, body, network = self.robots, self._body, self.network
-        begin = self._conductor.start_at
         if reason == AT_END:
-            self._states = body.read(t)
-            network.deliver(t)
-            for robot, state in zip(robots, self._states, strict=True):
-                robot.take(t, state)
+            self._receive(t)
         if reason != AT_HAZARDS:
-            self._transmit(t)
-            for robot in robots:
-                robot.detect(t)
-        for row, robot in enumerate(robots):
+            self._detect(t)
+        self._act(t)
+
+    def _receive(self, t: float) -> None:
+        self._states = self._body.read(t)
+        self.network.deliver(t)
+        for robot, state in zip(self.robots, self._states, strict=True):
+            robot.take(t, state)
+
+    def _detect(self, t: float) -> None:
+        self._transmit(t)
+        for robot in self.robots:
+            robot.detect(t)
+
+    def _act(self, t: float) -> None:
+        body, network, begin = self._body, self.network, self._conductor.start_at
+        for row, robot in enumerate(self.robots):
             robot.finish(t)
             if robot.takes_off:
                 body.takeoff((row,), (robot.assignment.hover,))
@@ -203,9 +257,9 @@ class VirtualRun:
                 body.stop((row,))
             if robot.descending and row not in network.retired and t < begin + self._duration:
                 network.retire(row, t)
-        body.command([robot.setpoint for robot in robots])
+        body.command([robot.setpoint for robot in self.robots])
         if touches := self.twin.touches():
-            self._touches += touches
+            self.touches += touches
 
     def _transmit(self, t: float) -> None:
         """Phases move on, poses are transmitted, and goals of a central controller."""
@@ -298,7 +352,7 @@ class VirtualRun:
             updates=np.array([robot.updates for robot in self.robots], dtype=np.intp),
             interventions=np.array([robot.interventions for robot in self.robots], dtype=np.intp),
             avoided=np.array([robot.evasions for robot in self.robots], dtype=np.intp),
-            touches=tuple(replace(touch, time=touch.time - begin) for touch in self._touches),
+            touches=tuple(replace(touch, time=touch.time - begin) for touch in self.touches),
             ticks=round(self.plan.experiment.duration_s / self.dt),
             airborne=conductor.airborne_at - begin,
             ended=self._tick * self.dt - begin,

@@ -358,7 +358,8 @@ def keeps_limits(robot: Robot) -> bool:
     return fits and all(map(isfinite, setpoint))
 
 
-OTHERS, CHOICE = ("obstacle-course", "convoy", "architectures"), registry.names(registry.TRIGGERS)
+OTHERS = ("obstacle-course", "convoy", "architectures")
+CHOICE = [name for name in registry.names(registry.TRIGGERS) if not registry.struct(registry.TRIGGERS, name).FILES]
 DAILY = [*zip(cycle(OTHERS), CHOICE, strict=False)]
 
 

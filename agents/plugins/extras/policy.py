@@ -1,31 +1,65 @@
-"""Learned policies; their runtime, onnxruntime, is the extra `policy`, and loads with numpy at first use."""
+"""Learned policies: a law and a trigger from files in the ONNX format.
+
+Their runtime, onnxruntime, is the extra `policy`, and loads with numpy at first use.
+"""
 
 from __future__ import annotations
 
 from base64 import b64decode
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from math import isfinite, nan
 from typing import Annotated, Any, ClassVar, Final
 
 from msgspec import Meta
 
-from zenpark import Control, Law, Measure, Memory, PluginError, RobotFacts, Severity, View
+from agents.plugins.extras.observation import Observation
+from zenpark import (
+    Control,
+    Law,
+    Measure,
+    Memory,
+    PluginError,
+    RobotFacts,
+    Severity,
+    Trigger,
+    TriggerView,
+    Values,
+    View,
+)
 
-OWN: Final = 4  # numbers of a robot's own motion in an observation
-EACH: Final = 4  # numbers of each neighbour
 PLANAR: Final = 2  # numbers of an action
+JUDGED: Final = 3  # numbers that a learned trigger judges
+MOST: Final = 1e6  # what a learned trigger is told for an infinite number
+ACTIONS: Final = ("velocity", "goal")
+MEMORY: Final = "memory"  # variable with the state of a recurrent policy
+OBSERVES, EACH, ACTION = "observes", "observes_each", "action"  # keys of the metadata of a model
 
-Act = Callable[[Sequence[float]], tuple[float, float]]
+Act = Callable[[Sequence[float], Values], tuple[Values, Values]]
+Given = Annotated[str, Meta(description="ONNX file beside the experiment file: its name")]
+Content = Annotated[str, Meta(description="content of that file, in base64: it goes with the experiment")]
+
+
+@dataclass(frozen=True)
+class Model:
+    """A learned function: its sizes, its metadata, and `act`, from inputs and memory to outputs and memory."""
+
+    size: int  # count of inputs
+    result: int  # count of outputs
+    memory: int  # count of numbers that it remembers
+    metadata: Mapping[str, str]
+    act: Act
 
 
 class Policy(Law, frozen=True):
     """v_i = π(o_i): a policy that was learned elsewhere, from a file in the ONNX format.
 
-    π takes one observation of 4 + 4n numbers, float32: own x, y [m] and v_x, v_y [m/s]; then for each of n neighbours,
-    by their numbers among the robots, p̂_j − p_i and the wanted p_j − p_i of the link, x and y each [m]. What is unknown
-    or not there is 0. π gives v_x, v_y [m/s]. What it guarantees is up to its author: avoidance and setpoint filter
-    have the last word.
+    π takes one observation, float32. Its metadata name what that is, see docs/policy.md; without them it is 4 + 4n
+    numbers: own x, y [m] and v_x, v_y [m/s]; then for each of n neighbours, by their numbers among the robots,
+    p̂_j − p_i and the wanted p_j − p_i of the link, x and y each [m]. What is unknown or not there is 0. π gives v_x,
+    v_y [m/s], or where to go from here [m]. What it guarantees is up to its author: avoidance and setpoint filter have
+    the last word.
     """
 
     PREDICTION: ClassVar[str] = "constant-velocity"
@@ -36,78 +70,141 @@ class Policy(Law, frozen=True):
     LIBRARY: ClassVar[str] = "onnxruntime"
     FILES: ClassVar[Mapping[str, str]] = {"file": "model"}
 
-    file: Annotated[str, Meta(description="ONNX file beside the experiment file: its name")] = ""
-    model: Annotated[str, Meta(description="content of that file, in base64: it goes with the experiment")] = ""
+    file: Given = ""
+    model: Content = ""
 
     def begin(self, robot: RobotFacts) -> Memory:
-        """Nothing is remembered; raises PluginError for a model that cannot be used."""
-        load(self.model)
-        return {}
+        """State of a recurrent policy, 0 at first; raises PluginError for a model that cannot be used."""
+        size = load(self.model)[1].memory
+        return {MEMORY: (0.0,) * size} if size else {}
 
     def step(self, view: View, memory: Memory) -> Control:
         """Action for what is observed now."""
-        places, act = load(self.model)
-        x, y = act(observe(view, places))
-        return Control(velocity=(x, y, nan), measures={"wanted_x": x, "wanted_y": y})
+        observation, model = load(self.model)
+        (x, y), state = model.act(observation.of(view), memory.get(MEMORY, ()))
+        found, measures = {MEMORY: state} if state else {}, {"wanted_x": x, "wanted_y": y}
+        return steered(view, x, y, model.metadata.get(ACTION, ACTIONS[0]), memory=found, measures=measures)
 
     def analyse(self, plan: Any) -> Iterable[tuple[Severity, str, str]]:  # noqa: ANN401 - as its base
         """Robots with more neighbours than the policy has places for."""
-        places, _ = load(self.model)
+        observation, _ = load(self.model)
         for name in plan.experiment.robots:
-            if (count := len(plan.assignment(name).neighbours)) > places:
+            count, places = len(plan.assignment(name).neighbours), observation.places
+            if observation.each and count > places:
                 message = f"{name} has {count} neighbours, and the policy observes {places}: the last ones are left out"
                 yield "warning", message, "take fewer links, or a policy with more inputs"
 
 
-def observe(view: View, places: int) -> list[float]:
-    """Observation of the first n neighbours: 4 + 4 n numbers."""
-    (x, y, _), found = view.position, [*view.position[:2], *view.velocity[:2]]
-    for each in view.neighbours[:places]:
-        wanted_x, wanted_y, _ = each.link.relative
-        found += [each.position[0] - x, each.position[1] - y, -wanted_x, -wanted_y]
-    found += [0.0] * (OWN + EACH * places - len(found))
-    return [each if isfinite(each) else 0.0 for each in found]
+class PolicyTrigger(Trigger, frozen=True):
+    """τ(‖ε‖, t − t_k, Σ|e|) > 0: a trigger that was learned elsewhere, from a file in the ONNX format.
+
+    τ takes three numbers, float32, and gives one: the deviation [m], the time since the last event [s], and the error
+    of the robot's links [m], 0 where it is unknown.
+    """
+
+    JUDGES_ERRORS: ClassVar[bool] = True
+    LIBRARY: ClassVar[str] = "onnxruntime"
+    FILES: ClassVar[Mapping[str, str]] = {"file": "model"}
+
+    file: Given = ""
+    model: Content = ""
+
+    def fires(self, view: TriggerView) -> bool:
+        judged = view.deviation, view.since_event, view.error
+        (found,), _ = load_trigger(self.model).act([_bounded(each) for each in judged], ())
+        return found > 0.0
+
+
+def steered(view: View, x: float, y: float, action: str, **others: Any) -> Control:  # noqa: ANN401 - of a control
+    """Control of an action: a velocity [m/s], or a goal as seen from the robot [m]; heights are held."""
+    if action == ACTIONS[0]:
+        return Control(velocity=(x, y, nan), **others)
+    return Control(goal=(view.position[0] + x, view.position[1] + y, nan), **others)
 
 
 @lru_cache(maxsize=8)
-def load(model: str) -> tuple[int, Act]:
-    """Neighbours that a policy observes, and its function; kept, since it is the same for all robots.
+def load(model: str) -> tuple[Observation, Model]:
+    """What a policy observes, and the policy; raises PluginError as `read`, or for a model that does not fit."""
+    found = read(model, "law policy")
+    about = found.metadata
+    if found.result != PLANAR:
+        raise PluginError(f"the law policy needs a model with an output of 2 numbers; this gives {found.result}")
+    if (action := about.get(ACTION, ACTIONS[0])) not in ACTIONS:
+        raise PluginError(
+            f"the law policy cannot use its file: its metadata have {ACTION} = {action!r}; take one of "
+            f"{', '.join(ACTIONS)}"
+        )
+    default = Observation()
+    own, each = about.get(OBSERVES, " ".join(default.own)), about.get(EACH, " ".join(default.each))
+    try:
+        return Observation.sized(own, each, found.size), found
+    except PluginError as error:
+        raise PluginError(f"the law policy cannot use its file: {error}") from None
 
-    Raises PluginError without onnxruntime, or for a model of other inputs and outputs.
+
+@lru_cache(maxsize=8)
+def load_trigger(model: str) -> Model:
+    """A learned trigger; raises PluginError as `read`, or for a model that does not fit."""
+    found = read(model, "trigger policy")
+    if (found.size, found.result, found.memory) != (JUDGED, 1, 0):
+        raise PluginError(
+            f"the trigger policy needs a model of {JUDGED} inputs (deviation, time since the last event, error) and "
+            f"one output; this has {found.size} and {found.result}"
+        )
+    return found
+
+
+def read(model: str, what: str) -> Model:
+    """Model of a file, in base64; `what` it is for stands in errors.
+
+    Raises PluginError without onnxruntime, or for a file that is none, or has other inputs and outputs than one of
+    each, and with a memory two.
     """
     try:
         import numpy as np  # noqa: PLC0415 - comes with the extra
         import onnxruntime as ort  # noqa: PLC0415 - an extra
     except ImportError:
         raise PluginError(
-            "the law policy needs an extra library: ./zenpark install onnxruntime, or pip install -e '.[policy]'"
+            f"the {what} needs an extra library: ./zenpark install onnxruntime, or pip install -e '.[policy]'"
         ) from None
     if not model:
-        raise PluginError("the law policy has no model: give `file`, an ONNX file beside the experiment file")
+        raise PluginError(f"the {what} has no model: give `file`, an ONNX file beside the experiment file")
     options = ort.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1  # the same order of sums everywhere
     options.log_severity_level = 4
     try:
         session = ort.InferenceSession(b64decode(model), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # noqa: BLE001 - its own exceptions have no common base
-        raise PluginError(f"the law policy cannot use its file: {str(error).splitlines()[0]}") from None
+        raise PluginError(f"the {what} cannot use its file: {str(error).splitlines()[0]}") from None
     takes, gives = session.get_inputs(), session.get_outputs()
-    size, result = (sizes[-1] if (sizes := each[0].shape) else 0 for each in (takes, gives))
-    alone = len(takes) == len(gives) == 1 and all(
-        each.type == "tensor(float)" and all(not isinstance(n, int) or n == 1 for n in each.shape[:-1])
-        for each in (*takes, *gives)
-    )
-    if not (alone and isinstance(size, int) and size >= OWN and (size - OWN) % EACH == 0 and result == PLANAR):
+    plain = len(takes) == len(gives) and len(takes) in (1, 2) and all(map(_is_row, (*takes, *gives)))
+    sizes = [each.shape[-1] for each in (*takes, *gives)] if plain else []
+    if not plain or (len(takes) == 2 and sizes[1] != sizes[3]):
         shapes = "; ".join(f"{each.name}: {each.type} {each.shape}" for each in (*takes, *gives))
         raise PluginError(
-            f"the law policy needs a model of one float input of 4 + 4n numbers and one float output of 2; this has "
-            f"{shapes}"
+            f"the {what} needs a model of one float input and one float output, and with a memory of a second one of "
+            f"each, both of one size; this has {shapes}"
         )
-    name, shape = takes[0].name, [1] * (len(takes[0].shape) - 1) + [size]
+    ends = [(each.name, [1] * (len(each.shape) - 1) + [each.shape[-1]]) for each in takes]
 
-    def act(observation: Sequence[float]) -> tuple[float, float]:
-        (found,) = session.run(None, {name: np.array(observation, dtype=np.float32).reshape(shape)})
-        x, y = found.ravel().tolist()
-        return x, y
+    def act(inputs: Sequence[float], memory: Values) -> tuple[Values, Values]:
+        given = zip(ends, (inputs, memory), strict=False)
+        feed = {name: np.array(numbers, dtype=np.float32).reshape(shape) for (name, shape), numbers in given}
+        found, *state = (tuple(each.ravel().tolist()) for each in session.run(None, feed))
+        return found, state[0] if state else ()
 
-    return (size - OWN) // EACH, act
+    memory = sizes[1] if len(takes) == 2 else 0
+    return Model(sizes[0], sizes[len(takes)], memory, session.get_modelmeta().custom_metadata_map, act)
+
+
+def _is_row(end: Any) -> bool:  # noqa: ANN401 - an input or an output
+    """Whether it has one row of numbers, of a known length."""
+    *rows, last = end.shape or [None]
+    single = all(not isinstance(each, int) or each == 1 for each in rows)
+    return end.type == "tensor(float)" and single and isinstance(last, int) and last > 0
+
+
+def _bounded(value: float) -> float:
+    if value != value:  # noqa: PLR0124 - NaN
+        return 0.0
+    return value if isfinite(value) else MOST

@@ -23,6 +23,7 @@ from experiments.catalogue import index
 from experiments.definition.plan import Plan
 from experiments.file import document
 from tests.agents.bench import Bench, near, own
+from tests.agents.learned import learned
 from tests.cases import mostly_slow
 from tests.small import triangle
 
@@ -39,8 +40,10 @@ SAMPLES = (0.3, [0.3, 0.2], [[0.3, 0.2], [-0.2, 0.4]])
 def made(group, name):
     """A plug-in with its defaults; numbers and places stand for parameters without one."""
     kind = registry.struct(group, name)
-    if group == LAWS and kind.LIBRARY:
-        pytest.importorskip(kind.LIBRARY, reason=f"the law {name} needs {kind.LIBRARY}")
+    if group in (LAWS, TRIGGERS) and kind.LIBRARY:
+        pytest.importorskip(kind.LIBRARY, reason=f"{name} needs {kind.LIBRARY}")
+    if group == TRIGGERS and kind.FILES:
+        return registry.build(group, {"kind": name, "model": learned(3, 1, bias=-0.1)})
     if group == LAWS and kind.FILES and name in index.names():
         return document.read(index.find_file(name), []).plan.law
     if group == PLANNERS and kind.FILES:

@@ -78,7 +78,7 @@ class Play:
         self.intervals = [later - earlier for earlier, later in itertools.pairwise(events)]
 
 
-NAMES = registry.names(registry.TRIGGERS)
+NAMES = [name for name in registry.names(registry.TRIGGERS) if not registry.struct(registry.TRIGGERS, name).FILES]
 FAMILIES = {
     "periodic", "send-on-delta", "relative", "mixed", "decaying", "dynamic", "integral", "predictive",
     "self-triggered", "lyapunov", "relative-control",

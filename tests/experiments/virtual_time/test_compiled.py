@@ -61,14 +61,14 @@ def follower(**parts):
     return small_pair(**{"duration_s": 4.0, "formation": links, "disturbance": noise, "trigger": "periodic", **parts})
 
 
-def plugins(group, place=""):
-    every = [plugin(group, name) for name in registry.names(group)]
-    return [each for each in every if not place or place in each.PLACES]
+def plugins(group):
+    return [plugin(group, name) for name in registry.names(group)]
 
 
 def every_plugin():
     """Experiment, and change of its robots: each has the next law, trigger, predictor, avoidance and kind."""
-    sending, updating = plugins(TRIGGERS, "communication"), plugins(TRIGGERS, "control")
+    quiet = [each for each in plugins(TRIGGERS) if not each.FILES]
+    sending, updating = ([each for each in quiet if place in each.PLACES] for place in ("communication", "control"))
     predictors, avoidances = plugins(PREDICTORS), plugins(AVOIDANCES)
     laws = [law for law in plugins(LAWS) if isinstance(law, Gradient)]
     kinds = ("crazyflie", "khepera4", "tello", "turtlebot3", "omni", "ackermann", "double-integrator")

@@ -1,5 +1,6 @@
 """A learned policy acts in flight as it does offline, and is refused where it does not fit."""
 
+import math
 import runpy
 import sys
 from base64 import b64decode, b64encode
@@ -8,18 +9,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from agents.body.interface import RangeScan
 from agents.decision.stepping import Stepping
 from agents.formation.link import Link
 from agents.plugins.extras import policy
-from agents.plugins.extras.policy import Policy
+from agents.plugins.extras.observation import Observation
+from agents.plugins.extras.policy import Policy, PolicyTrigger
 from agents.plugins.law import NeighbourView, RobotFacts, View
 from agents.plugins.registry import PluginError
+from agents.plugins.triggers import TriggerView
 from agents.vectors import UNKNOWN, ZERO
 from experiments.catalogue import index
 from experiments.file import document
 from experiments.file.document import DocumentError
 from experiments.virtual_time.log import RunRecorder
 from experiments.virtual_time.simulation import simulate
+from tests.agents.learned import learned, learned_bytes
 
 pytest.importorskip("onnxruntime", reason="the law policy is the extra [policy]: ./zenpark install onnxruntime")
 onnx = pytest.importorskip("onnx", reason="policies are written with onnx")
@@ -41,7 +46,7 @@ def test_a_policy_acts_in_flight_as_offline(case, most, monkeypatch):
 
     def watched(self, view, memory):
         control = step(self, view, memory)
-        seen.append(policy.observe(view, 3))
+        seen.append(policy.load(self.model)[0].of(view))
         acted.append(control.velocity[:2])
         return control
 
@@ -62,8 +67,8 @@ def test_the_policy_imitates_its_expert(tmp_path, trained):
     actions = offline(situations)
     if trained:
         training["write"](training["train"](), tmp_path / "new.onnx")
-        _, act = policy.load(b64encode((tmp_path / "new.onnx").read_bytes()).decode())
-        actions = np.array([act(each) for each in situations])
+        _, new = policy.load(b64encode((tmp_path / "new.onnx").read_bytes()).decode())
+        actions = np.array([new.act(each, ())[0] for each in situations])
     assert np.sqrt(((actions - training["expert"](situations)) ** 2).sum(axis=1).mean()) < 0.015
 
 
@@ -75,18 +80,12 @@ def test_observations():
     view.position, view.velocity = (0.2, 0.1, 0.0), UNKNOWN
     expected = [0.2, 0.1, 0, 0, 0.8, 1.9, -0.5, 0.5, -0.2, 0.4, 0, 0]
     for count, wanted in ((1, expected[:8]), (2, expected), (3, [*expected, 0, 0, 0, 0])):
-        assert policy.observe(view, count) == pytest.approx(wanted)
+        assert Observation(places=count).of(view) == pytest.approx(wanted)
 
 
 def model(folder, inputs, outputs, kind=1):
     """File of a policy that is a matrix of zeros."""
-    made, value = onnx.helper, onnx.helper.make_tensor_value_info
-    zeros = onnx.numpy_helper.from_array(np.zeros((inputs, outputs), dtype={1: np.float32, 11: float}[kind]), "w")
-    node = made.make_node("MatMul", ["o", "w"], ["v"])
-    ends = [value("o", kind, [1, inputs])], [value("v", kind, [1, outputs])]
-    graph = made.make_graph([node], "zero", *ends, [zeros])
-    whole = made.make_model(graph, opset_imports=[made.make_opsetid("", 17)], ir_version=8)
-    (folder / "own.onnx").write_bytes(whole.SerializeToString())
+    (folder / "own.onnx").write_bytes(learned_bytes(inputs, outputs, kind=kind))
 
 
 def own_policy(folder, name="own.onnx"):
@@ -97,10 +96,16 @@ def own_policy(folder, name="own.onnx"):
 
 
 def test_what_is_no_policy_is_refused(tmp_path, monkeypatch):
-    for sizes in ((15, 2), (16, 3), (16, 2, 11), (3, 2)):
+    faults = {
+        (15, 2): r"needs a model of 4 \+ 4n inputs; this has 15",
+        (16, 3): "output of 2 numbers; this gives 3",
+        (16, 2, 11): r"one float input .* this has o: tensor\(double\)",
+        (3, 2): r"needs a model of 4 \+ 4n inputs; this has 3",
+    }
+    for sizes, fault in faults.items():
         model(tmp_path, *sizes)
         given = own_policy(tmp_path).cases()["periodic"].assignment("CF01")
-        with pytest.raises(PluginError, match="one float input of 4 \\+ 4n numbers"):
+        with pytest.raises(PluginError, match=fault):
             Stepping(given)
     (tmp_path / "own.onnx").write_bytes(b"nothing")
     given = own_policy(tmp_path).cases()["periodic"].assignment("CF01")
@@ -142,3 +147,58 @@ def test_more_neighbours_than_places_are_a_warning(tmp_path):
     plan = own_policy(tmp_path).cases()["periodic"]
     severity, message, _ = next(iter(plan.law.analyse(plan)))
     assert (severity, message.partition(",")[0]) == ("warning", "CF01 has 3 neighbours")
+
+
+def test_metadata_name_observations_and_action():
+    facts = RobotFacts("B", 1, 3, flies=False, speed=0.2, step_s=0.1)
+    near = NeighbourView(0, "A", (1.0, 2.0, 0.0), (0.1, 0.0, 0.0), 0.0, 0.4, {}, Link(relative=(0.5, -0.5, 0.0)))
+    view = View(facts, {}, [near])
+    view.position, view.target, view.deviation, view.yaw = (0.2, 0.1, 0.7), (1.0, 0.0, 0.7), 0.03, math.pi
+    view.scan = RangeScan(0.0, (0.1, 1.6), (0.0, 0.0), (2.0, 0.5))
+    about = {"observes": "height yaw target deviation scan:4", "observes_each": "place moves age"}
+    observation, found = policy.load(learned(20, 2, bias=0.25, action="goal", **about))
+    expected = [0.7, -1.0, 0.0, 0.8, -0.1, 0.03, 0.5, 2.0, 0.0, 0.0, 0.8, 1.9, 0.1, 0.0, 0.4]
+    assert observation.of(view) == pytest.approx([*expected, 0, 0, 0, 0, 0], abs=1e-12)
+    control = Policy(model=learned(20, 2, bias=0.25, action="goal", **about)).step(view, {})
+    assert control.goal == pytest.approx((0.45, 0.35, math.nan), nan_ok=True)
+    assert found.memory == 0
+
+
+def test_recurrent_policies_remember():
+    law = Policy(model=learned(4, 2, memory=3, observes_each=""))
+    robot = RobotFacts("B", 1, 3, flies=False, speed=0.2, step_s=0.1)
+    view, memory = View(robot, {}, []), law.begin(robot)
+    view.position = (0.2, 0.1, 0.0)
+    wanted = []
+    for _ in range(3):
+        control = law.step(view, memory)
+        memory = control.memory
+        wanted.append(control.velocity[0])
+    assert wanted == pytest.approx([0.0, 0.9, 1.35], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("about", "fault"),
+    [
+        ({"observes": "position speed"}, "cannot observe 'speed'; known: position, .*"),
+        ({"observes": "position scan:x"}, "cannot observe 'scan:x'; known: position, .*, scan:8"),
+        ({"observes_each": "plac"}, "cannot observe 'plac'; known: place, wanted, distance, moves, age"),
+        ({"observes_each": ""}, r"needs a model of 4 \+ 0n inputs; this has 16"),
+        ({"action": "force"}, "action = 'force'; take one of velocity, goal"),
+    ],
+)
+def test_metadata_that_are_nonsense_are_refused(about, fault):
+    with pytest.raises(PluginError, match=fault):
+        policy.load(learned(16, 2, **about))
+
+
+def test_learned_triggers_fire_above_zero():
+    trigger = PolicyTrigger(model=learned(3, 1, bias=-0.02, weights=((1.0,), (0.0,), (0.0,))))
+    view = TriggerView({})
+    for deviation, fires in ((0.01, False), (0.03, True), (math.inf, True), (math.nan, False)):
+        view.deviation, view.error = deviation, math.nan
+        assert trigger.fires(view) == fires
+    with pytest.raises(PluginError, match=r"3 inputs .* and one output; this has 4 and 1"):
+        PolicyTrigger(model=learned(4, 1)).fires(view)
+    with pytest.raises(PluginError, match="trigger policy has no model: give `file`"):
+        PolicyTrigger().fires(view)
