@@ -203,8 +203,11 @@ class Robot:
 
     def view(self, t: float) -> View:
         """View of the law for its step at `t` [s], between the halves of a tick; of a law that steps, once a tick."""
-        now = self.now
-        return self.goals.view(t, now.position, now.velocity, now.yaw, self.lifecycle.start_at)
+        now, goals = self.now, self.goals
+        start = self.lifecycle.start_at
+        if goals.changes_shape:
+            goals.reshape(t - start, now.position, t)
+        return goals.view(t, now.position, now.velocity, now.yaw, start)
 
     def missing_neighbours(self) -> list[str]:
         """Neighbours that the robot has never received, or that are lost; likewise its central controller."""

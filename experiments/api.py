@@ -41,6 +41,8 @@ if TYPE_CHECKING:
     from experiments.check.check import check, figures
     from experiments.definition import formation, graph, rigidity
     from experiments.file.document import Document, load, loads
+    from experiments.learning.environment import Environment
+    from experiments.learning.vector import Environments, SingleAgent
     from experiments.metrics import signals
     from experiments.metrics.metric import Metric
     from experiments.metrics.signals import Measurement
@@ -61,6 +63,8 @@ __all__ = [  # noqa: RUF022 - by subject, as in docs/python.md
     "Law", "Gradient", "Control", "Said", "Trigger", "Planner", "Metric", "Trace",
     # more of experiments
     "Document", "figures", "reopen_seeds", "folder", "law_file",
+    # learning
+    "Environment", "Environments", "SingleAgent",
     # what laws and metrics get and raise
     "View", "NeighbourView", "Memory", "Values", "is_known", "Measure", "RobotFacts", "Severity", "Link", "PluginError",
     "Measurement", "Array", "Positive", "NotNegative",

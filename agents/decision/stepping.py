@@ -103,7 +103,7 @@ class Stepping:
         self.measures: dict[str, float] = {}  # likewise
         self.moves = True  # the robot may move; set by its caller, and likewise
         self.scan: Any = None  # range readings
-        self.deviation = nan  # of what the neighbours believe [m]
+        self.deviation = nan  # deviation of what the neighbours believe [m]
         self.tick, self._stepped = 0, -1  # number of the tick since the common start
         self._target = UNKNOWN
 

@@ -68,7 +68,7 @@ class Trigger(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     JUDGES_ERRORS: ClassVar[bool] = False  # uses errors of the formation, which are 0 for robots that a centre guides
     JUDGES_DRIFT: ClassVar[bool] = False  # waits by the drift of the pose, and uses no other input meanwhile
     TIMED: ClassVar[bool] = False  # fires by time alone, whatever is measured
-    LIBRARY: ClassVar[str] = ""  # as those of a law, like `FILES`
+    LIBRARY: ClassVar[str] = ""  # `LIBRARY` and `FILES` are those of a law
     FILES: ClassVar[Mapping[str, str]] = {}
     MEMORY: ClassVar[Mapping[str, float]] = {}  # what it remembers from question to question, with its first values
 

@@ -194,13 +194,18 @@ class VirtualRun:
                 return
             self._end_tick(t)
 
+    @property
+    def time(self) -> float:
+        """Time of the tick that is next, or half done [s]."""
+        return self._tick * self.dt
+
     def begin(self) -> float:
         """Fly to the common start; returns its time [s]. There all robots have observed, and `decide` comes next.
 
         Raises Stuck if robots do not become ready or airborne, or end before.
         """
         while not self._conductor.over:
-            t = self._tick * self.dt
+            t = self.time
             self.observe(t)
             if any(robot.begun for robot in self.robots):
                 return t
@@ -246,7 +251,8 @@ class VirtualRun:
             robot.detect(t)
 
     def _act(self, t: float) -> None:
-        body, network, begin = self._body, self.network, self._conductor.start_at
+        body, network = self._body, self.network
+        begin = self._conductor.start_at
         for row, robot in enumerate(self.robots):
             robot.finish(t)
             if robot.takes_off:

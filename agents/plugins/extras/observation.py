@@ -21,8 +21,8 @@ OWN: Final[Mapping[str, tuple[int, Callable[[View], Numbers]]]] = {
     "yaw": (2, lambda view: (cos(view.yaw), sin(view.yaw)) if isfinite(view.yaw) else (0.0, 0.0)),
     # place of its plan, seen from the robot [m]
     "target": (2, lambda view: (view.target[0] - view.position[0], view.target[1] - view.position[1])),
-    "deviation": (1, lambda view: (view.deviation,)),  # of what the neighbours believe [m]
-    "time": (1, lambda view: (view.time,)),  # since the common start [s]
+    "deviation": (1, lambda view: (view.deviation,)),  # error of what the neighbours believe [m]
+    "time": (1, lambda view: (view.time,)),  # time since the common start [s]
 }
 # parts of each neighbour
 EACH: Final[Mapping[str, tuple[int, Callable[[View, NeighbourView], Numbers]]]] = {
@@ -31,7 +31,7 @@ EACH: Final[Mapping[str, tuple[int, Callable[[View, NeighbourView], Numbers]]]] 
     "wanted": (2, lambda _, of: (-of.link.relative[0], -of.link.relative[1])),  # likewise, by the target of the link
     "distance": (1, lambda _, of: (of.link.distance,)),  # wanted [m]
     "moves": (2, lambda _, of: of.velocity[:2]),  # velocity in its last pose [m/s]
-    "age": (1, lambda _, of: (of.age,)),  # of its last pose [s]
+    "age": (1, lambda _, of: (of.age,)),  # age of its last pose [s]
 }
 
 

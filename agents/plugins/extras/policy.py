@@ -31,7 +31,7 @@ from zenpark import (
 
 PLANAR: Final = 2  # numbers of an action
 JUDGED: Final = 3  # numbers that a learned trigger judges
-MOST: Final = 1e6  # what a learned trigger is told for an infinite number
+MOST: Final = 1e6  # input of a learned trigger for an infinite number
 ACTIONS: Final = ("velocity", "goal")
 MEMORY: Final = "memory"  # variable with the state of a recurrent policy
 OBSERVES, EACH, ACTION = "observes", "observes_each", "action"  # keys of the metadata of a model
@@ -42,7 +42,7 @@ Content = Annotated[str, Meta(description="content of that file, in base64: it g
 
 
 @dataclass(frozen=True)
-class Model:
+class LearnedModel:
     """A learned function: its sizes, its metadata, and `act`, from inputs and memory to outputs and memory."""
 
     size: int  # count of inputs
@@ -123,8 +123,8 @@ def steered(view: View, x: float, y: float, action: str, **others: Any) -> Contr
 
 
 @lru_cache(maxsize=8)
-def load(model: str) -> tuple[Observation, Model]:
-    """What a policy observes, and the policy; raises PluginError as `read`, or for a model that does not fit."""
+def load(model: str) -> tuple[Observation, LearnedModel]:
+    """Observation of a policy, and the policy; raises PluginError as `read`, or for a model that does not fit."""
     found = read(model, "law policy")
     about = found.metadata
     if found.result != PLANAR:
@@ -143,7 +143,7 @@ def load(model: str) -> tuple[Observation, Model]:
 
 
 @lru_cache(maxsize=8)
-def load_trigger(model: str) -> Model:
+def load_trigger(model: str) -> LearnedModel:
     """A learned trigger; raises PluginError as `read`, or for a model that does not fit."""
     found = read(model, "trigger policy")
     if (found.size, found.result, found.memory) != (JUDGED, 1, 0):
@@ -154,7 +154,7 @@ def load_trigger(model: str) -> Model:
     return found
 
 
-def read(model: str, what: str) -> Model:
+def read(model: str, what: str) -> LearnedModel:
     """Model of a file, in base64; `what` it is for stands in errors.
 
     Raises PluginError without onnxruntime, or for a file that is none, or has other inputs and outputs than one of
@@ -194,7 +194,7 @@ def read(model: str, what: str) -> Model:
         return found, state[0] if state else ()
 
     memory = sizes[1] if len(takes) == 2 else 0
-    return Model(sizes[0], sizes[len(takes)], memory, session.get_modelmeta().custom_metadata_map, act)
+    return LearnedModel(sizes[0], sizes[len(takes)], memory, session.get_modelmeta().custom_metadata_map, act)
 
 
 def _is_row(end: Any) -> bool:  # noqa: ANN401 - an input or an output

@@ -1,0 +1,214 @@
+"""Environments of learning: PettingZoo's and Gymnasium's checkers, episodes that are flights, and bad input."""
+
+import math
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pettingzoo", reason="environments are the extra [learn]: ./zenpark install pettingzoo gymnasium")
+
+from gymnasium.utils.env_checker import check_env
+from pettingzoo.test import parallel_api_test, parallel_seed_test
+
+from agents.errors import ExplainedError
+from agents.plugins.law import Control, Law
+from agents.plugins.laws import Gradient
+from experiments.catalogue import index
+from experiments.file import document
+from experiments.learning.actions import LearningError
+from experiments.learning.environment import Environment
+from experiments.learning.vector import Environments, SingleAgent
+from experiments.virtual_time.simulation import VirtualRun
+
+
+def distributed_case(name):
+    """First case of a file in which the robots decide for themselves; None without one."""
+    return next((case for case, plan in document.read(name).cases().items() if not plan.guided), None)
+
+
+FILES = [(name, case) for name in index.names() if (case := distributed_case(name))]
+LONGER = (("robotic-park", 2.0), ("flocking", 1.5))
+
+
+def load(name, *overrides, duration_s=0.5):
+    return document.load(name, f"duration_s={duration_s}", *overrides)
+
+
+def fly(made, seed, act):
+    """True positions (K, N, 3) after each decision of an episode, and the sum of all rewards."""
+    made.reset(seed=seed)
+    places, total = [], 0.0
+    while made.agents:
+        _, rewards, *_ = made.step({name: act(name, made.view(name)) for name in made.agents})
+        total += sum(rewards.values())
+        places.append([state.true_position for state in made._run.snapshot(0.0).states])
+    return np.array(places), total
+
+
+def flown(log, count, hz=10.0):
+    """True positions (K, N, 3) of a flight after each decision."""
+    return log.true_position[[int(np.argmin(abs(log.time - (k + 1) / hz))) for k in range(count)]]
+
+
+HEAVY = {"crowd", "mixed-reality"}  # 32 robots, and sensors of range
+CHECKED = [pytest.param(*each, marks=[pytest.mark.nightly] if each[0] in HEAVY else []) for each in FILES]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "case"), CHECKED)
+def test_checkers_of_pettingzoo_pass(name, case):
+    given = document.read(name)
+    starts = 1 if given.cases()[case].engine_name == "point-mass" else None
+
+    def made():
+        return Environment(given, case, talk=True, observes="time target", observes_each="place age", starts=starts)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        parallel_api_test(made(), num_cycles=5)
+        parallel_seed_test(made, num_cycles=5)
+
+
+class Pursuit(Law, frozen=True):
+    """The law of a file that is a gradient, as goals."""
+
+    inner: Law
+
+    def step(self, view, memory):
+        x, y, _ = view.position
+        pulls = [
+            self.inner.pull(tuple(a - b for a, b in zip(view.position, each.position, strict=True)), each.link)
+            for each in view.neighbours
+        ]
+        return Control(goal=(x + sum(u for u, _, _ in pulls), y + sum(v for _, v, _ in pulls), math.nan))
+
+
+def acting(made, law):
+    """Actions of a law, which remembers."""
+    memories = {}
+
+    def act(name, view):
+        memory = memories.setdefault(name, dict(law.begin(view.robot)))
+        control = law.step(view, memory)
+        memories[name] = dict(control.memory)
+        if control.velocity is not None:
+            return control.velocity[:2]
+        return control.goal[0] - view.position[0], control.goal[1] - view.position[1]
+
+    return act
+
+
+@pytest.mark.parametrize(
+    ("name", "seconds"), [("policy", 1.0), *(pytest.param(*each, marks=pytest.mark.slow) for each in LONGER)]
+)
+def test_episodes_are_flights(name, seconds):
+    given = load(name, "timeline=[]", duration_s=seconds)
+    for case, plan in given.cases().items():
+        gradient = isinstance(plan.law, Gradient)
+        law = Pursuit(plan.law) if gradient else plan.law
+        made = Environment(given, case, action="goal" if gradient else "velocity")
+        places, _ = fly(made, 7, acting(made, law))
+        moved = {each: replace(plan.assignment(each), law=law) for each in made.possible_agents} if gradient else {}
+        flight = VirtualRun(plan, 7, assignments=moved)
+        flight.fly(landing=False, progress=lambda _: None, watch=None)
+        assert len(places) == round(10 * seconds)
+        assert np.array_equal(places, flown(flight.log(), len(places)))
+
+
+def test_bad_input_names_place_and_remedy():
+    given, central = load("triangle"), document.read("architectures")
+    faults = {
+        "no case 'evnt' in this experiment\n  did you mean 'event'": lambda: Environment(given, "evnt"),
+        "triangle.toml: no agent 'KH3'; .*KH0": lambda: Environment(given, agents=["KH3"]),
+        "no action 'force'; known: velocity, goal": lambda: Environment(given, action="force"),
+        "cannot observe 'velocty'; known: position, velocity, .*": lambda: Environment(given, observes="velocty"),
+        "a central controller decides .*; take a case without one": lambda: Environment(central, "centralised"),
+    }
+    for fault, made in faults.items():
+        with pytest.raises(ExplainedError, match=fault):
+            made()
+
+
+def test_bad_actions_are_refused_before_they_fly():
+    made = Environment(load("triangle"), talk=True)
+    made.reset()
+    good = {name: np.zeros(3) for name in made.agents}
+    faults = {
+        "that of CF01 has the shape \\(2,\\); give 3 numbers: x, y, whether to transmit": good | {"CF01": np.zeros(2)},
+        "that of CF01 is .*nan.*, not finite; look for NaN": good | {"CF01": [0.0, math.nan, 0.0]},
+        "no agent 'CF1' flies now; did you mean 'CF01'": good | {"CF1": np.zeros(3)},
+        "there is none for KH01; give one for each of `env.agents`": {"CF01": np.zeros(3)},
+    }
+    for fault, actions in faults.items():
+        with pytest.raises(LearningError, match=fault):
+            made.step(actions)
+
+
+def test_states_go_on_to_the_last_bit():
+    made = Environment(load("policy"), "event-loss", starts=2)
+
+    def still(_name, _view):
+        return 0.1, -0.05
+
+    first, other, again = fly(made, 3, still), fly(made, None, still), fly(made, 3, still)
+    assert np.array_equal(first[0], again[0])
+    assert not np.array_equal(first[0], other[0])
+    assert made.reset()[1]["CF01"]["seed"] == 4  # in turn with 3
+
+
+def test_robots_that_touch_end_early():
+    made = Environment(load("triangle", duration_s=9.0), penalty=7.0, message_price=0.5, reward=lambda *_: 1.0)
+    made.reset()
+    ends = {}
+    while len(made.agents) == 3:
+        actions = dict.fromkeys(made.agents, (0.0, 0.0))
+        (x, y, _), (other,) = made.view("KH01").position, [e for e in made.view("KH01").neighbours if e.name == "KH02"]
+        actions["KH01"] = other.position[0] - x, other.position[1] - y
+        _, rewards, ends, truncated, infos = made.step(actions)
+        for name, info in infos.items():
+            assert rewards[name] == 1.0 - 0.5 * info["messages"] - 7.0 * ends[name]
+    assert ends == {"KH01": True, "KH02": True, "CF01": False}
+    assert not any(truncated.values())
+    assert made.agents == ["CF01"]
+
+
+def test_talk_is_what_the_agent_says():
+    made = Environment(load("policy", duration_s=2.0), "event", talk=True)
+    made.reset(seed=1)
+    sent = []
+    for k in range(10):
+        infos = made.step(dict.fromkeys(made.agents, (0.1, 0.0, 1.0 if k == 4 else -1.0)))[4]
+        sent.append(sum(each["messages"] for each in infos.values()))
+    assert sent[1:4] + sent[5:9] == [0] * 7  # before the longest silence is over
+    assert sent[4] == 4
+
+
+def test_one_agent_is_an_environment_of_gymnasium():
+    alone = SingleAgent(Environment(load("policy"), agents=["CF02"], starts=1))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # on infinite bounds, which places have
+        check_env(alone, skip_render_check=True)
+    with pytest.raises(LearningError, match="has one agent, not CF01, CF02"):
+        SingleAgent(Environment(load("policy")))
+
+
+@pytest.mark.parametrize("processes", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_vectors_are_their_environments(processes):
+    single = Environment(load("policy"), "event")
+    vector = Environments(single, 3, processes=processes)
+    try:
+        seen, _ = vector.reset(seed=5)
+        expected = np.array([[*single.reset(seed=seed)[0].values()] for seed in (5, 10_005, 20_005)])
+        assert np.array_equal(seen, expected.reshape(12, -1))
+        for _ in range(5):
+            seen, _, ended, truncated, infos = vector.step(np.tile([0.1, 0.0], (12, 1)))
+        assert not ended.any()
+        assert truncated.all()
+        assert infos["_final_obs"].all()
+        assert np.array_equal(seen[:4], np.array([*single.reset(seed=6)[0].values()]))
+        with pytest.raises(LearningError, match="not finite"):
+            vector.step(np.full((12, 2), math.nan))
+    finally:
+        vector.close()
