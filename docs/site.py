@@ -192,13 +192,14 @@ def recordings() -> Iterator[str]:
     yield "# Recordings\n"
     yield (
         "A recording is an [MCAP](https://mcap.dev) file with ROS 2 messages (CDR), their definitions included. Read"
-        " one with `mcap-ros2-support`, `rosbags`, rerun or Foxglove, or with `experiments.recording.reader`.\n"
+        " one with `mcap-ros2-support`, `rosbags`, rerun or Foxglove, or with `experiments.recording.playback`. A"
+        " message of zenpark has one field, `data`, the JSON that was on the network: `json.loads(message.data)`.\n"
     )
     yield from ("| topic | type | key on the network |", "|---|---|---|")
     from agents.network.keys import Keys  # noqa: PLC0415
 
     for topic in topics.TOPICS:
-        yield f"| `{topic.name}` | `zenpark_msgs/{topic.recorded.__name__}` | `{topic.key(Keys())}` |"
+        yield f"| `{topic.name}` | `zenpark_msgs/{topic.message.__name__}` | `{topic.key(Keys())}` |"
     yield "\n" + (inspect.getdoc(topics) or "").partition("\n\n")[2] + "\n"
     yield from _structs(topics)
 

@@ -406,7 +406,7 @@ M = TypeVar("M", bound=Message)
 # plug-ins may give numbers of numpy, which are no floats to msgspec
 _json = msgspec.json.Encoder(enc_hook=float)
 _msgpack = msgspec.msgpack.Encoder(enc_hook=float)
-_decoders: dict[tuple[type, bool], msgspec.json.Decoder[object] | msgspec.msgpack.Decoder[object]] = {}
+_decoders: dict[tuple[type, Encoding], msgspec.json.Decoder[object] | msgspec.msgpack.Decoder[object]] = {}
 
 
 def number(value: float) -> float | None:
@@ -488,15 +488,20 @@ def encode(message: Message, encoding: Encoding = "json") -> bytes:
     return _json.encode(message) if encoding == "json" else _msgpack.encode(message)
 
 
+def encoding_of(mime: str) -> Encoding:
+    """Encoding of a payload by its MIME type."""
+    return "msgpack" if mime.startswith(MSGPACK) else "json"
+
+
 def decode(payload: bytes, mime: str, kind: type[M]) -> M:
     """The message in a payload, by its MIME type; raises Malformed if the payload is too large, or not a `kind`."""
     if len(payload) > MAX_PAYLOAD:
         raise Malformed(f"{len(payload)} bytes are more than a {kind.__name__} can have")
-    packed = mime.startswith(MSGPACK)
-    decoder = _decoders.get((kind, packed))
+    encoding = encoding_of(mime)
+    decoder = _decoders.get((kind, encoding))
     if decoder is None:
-        decoder = msgspec.msgpack.Decoder(kind) if packed else msgspec.json.Decoder(kind)
-        _decoders[kind, packed] = decoder
+        decoder = msgspec.json.Decoder(kind) if encoding == "json" else msgspec.msgpack.Decoder(kind)
+        _decoders[kind, encoding] = decoder
     try:
         message = decoder.decode(payload)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:

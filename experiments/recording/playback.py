@@ -7,22 +7,25 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
 
 import msgspec
 import numpy as np
-from msgspec.structs import replace
+from msgspec.structs import astuple, replace
 
 from agents.body.kinds import KINDS, RecordedKind
 from agents.decision.lifecycle import Phase
 from agents.network.messages import (
     CentreState,
     Contact,
+    Encoding,
     Event,
+    Goal,
     HostClock,
     LawMemory,
+    Malformed,
+    Pose,
     State,
     Status,
     Variable,
@@ -43,10 +46,10 @@ from experiments.recording.losses import (
     counter_growth,
     lives,
 )
-from experiments.recording.reader import RecordingError, Records
+from experiments.recording.reader import RecordedMessage, RecordingError, Records
 from experiments.recording.resample import HOLE_S, attitude, line, step, turn
-from experiments.recording.ros2.cdr import Undecodable, codec
-from experiments.recording.topics import JSON, KINDS_JSON, METADATA, TOPICS, SentGoal, SentPose, SpokenPose, Topic
+from experiments.recording.ros2 import payload
+from experiments.recording.topics import JSON, KINDS_JSON, METADATA, TOPICS, SentGoal, SentPose, Topic
 from experiments.recording.trace import (
     ROUNDING_S,
     Goals,
@@ -62,6 +65,9 @@ AROUND_S: Final = 600.0  # [s] longest time before and after a run that a replay
 PHASES: Final = {phase.word: int(phase) for phase in Phase}
 LANDED: Final = (Phase.LANDING.word, Phase.DONE.word)
 NOWHERE: Final = (math.nan, math.nan, math.nan)
+# topics and encodings by their types in the file
+TYPES: Final = {payload.type_name(topic.message, each): (topic, each) for topic in TOPICS for each in payload.NAMES}
+RECORDED: Final[dict[type[msgspec.Struct], type[SentPose | SentGoal]]] = {Pose: SentPose, Goal: SentGoal}
 OPTIONAL: Final = ("attitude", "shadow_position", "shadow_yaw")  # columns that a trace may lack
 
 S = TypeVar("S", bound=msgspec.Struct)
@@ -72,24 +78,18 @@ class NotStarted(RecordingError):
     """The recording of a run that ended before its common start, so that there is nothing to show."""
 
 
-def topic_of(records: Records, channel: int) -> Topic | None:
-    """The topic of a channel in a file, None if another program wrote it; raises RecordingError for other fields."""
+def topic_of(records: Records, channel: int) -> tuple[Topic, Encoding] | None:
+    """Topic and encoding of a channel in a file, None if another program wrote it; raises RecordingError as `read`."""
     about = records.channels[channel]
     schema = records.schemas.get(about.schema_id)
-    if schema is None or (topic := _topics().get(schema.name)) is None:
+    if schema is None or (found := TYPES.get(schema.name)) is None:
         return None
-    if schema.data.decode(errors="replace") != codec(topic.recorded).schema:
+    if not schema.data.endswith(b"\n" + payload.FIELDS[found[1]].encode()):
         raise RecordingError(
-            f"{records.path}: {about.topic} was recorded by a version of zenpark with other fields of {schema.name}; "
+            f"{records.path}: {about.topic} was recorded by a version of zenpark with another form of {schema.name}; "
             "read it with that version"
         )
-    return topic
-
-
-@cache
-def _topics() -> dict[str, Topic]:
-    """Topics by their types in the file."""
-    return {codec(topic.recorded).name: topic for topic in TOPICS}
+    return found
 
 
 @dataclass(frozen=True)
@@ -224,26 +224,27 @@ class Content:
 
     def __init__(self, records: Records) -> None:
         self.records = records
-        self._lists: dict[type[msgspec.Struct], list[Any]] = {topic.recorded: [] for topic in TOPICS}
+        kinds = (topic.message for topic in TOPICS)
+        self._lists: dict[type[msgspec.Struct], list[Any]] = {RECORDED.get(kind, kind): [] for kind in kinds}
 
     def __getitem__(self, kind: type[S]) -> list[S]:
         return self._lists[kind]
 
     def fill(self) -> int:
         """Reads all messages and counts them; those of other types are passed over."""
-        readers: dict[int, Callable[[bytes], None] | None] = {}
+        readers: dict[int, Callable[[RecordedMessage], None] | None] = {}
         count = 0
         for message in self.records.messages():
             count += 1
             if message.channel not in readers:
-                readers[message.channel] = self._choose(message.channel)
+                readers[message.channel] = self._reader(message.channel)
             take = readers[message.channel]
             if take is not None:
                 try:
-                    take(message.data)
-                except Undecodable as error:
-                    raise RecordingError(f"{self.records.path}: message {count} is damaged: {error}") from None
-        self[SentPose].extend(self[SpokenPose])
+                    take(message)
+                except (Malformed, msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+                    text = f"message {count} is damaged, or of another version of zenpark: {error}"
+                    raise RecordingError(f"{self.records.path}: {text}") from None
         if self[HostClock]:
             right = Correction(self[HostClock])
             self[State][:] = [right.state(state) for state in self[State]]
@@ -276,11 +277,23 @@ class Content:
         landed = any(state.phase in LANDED for state in self[State])  # else the recording broke off
         return duration if not last or end > duration - (EARLY_S if landed else 0.0) else end
 
-    def _choose(self, channel: int) -> Callable[[bytes], None] | None:
-        if (topic := topic_of(self.records, channel)) is None:
+    def _reader(self, channel: int) -> Callable[[RecordedMessage], None] | None:
+        """Function that takes in a message of a channel; None if another program wrote it."""
+        if (found := topic_of(self.records, channel)) is None:
             return None
-        decode, append = codec(topic.recorded).decode, self._lists[topic.recorded].append
-        return lambda data: append(decode(data))
+        topic, encoding = found
+        recorded = RECORDED.get(topic.message)
+        append = self._lists[recorded or topic.message].append
+        decode = (msgspec.json if encoding == "json" else msgspec.msgpack).Decoder(topic.message).decode
+        if recorded is None:
+            return lambda message: append(decode(payload.unwrap(message.data, encoding)))
+
+        def take(message: RecordedMessage) -> None:
+            sent = payload.unwrap(message.data, encoding)
+            seconds, rest = divmod(message.logged, 10**9)
+            append(recorded(*astuple(decode(sent)), received=seconds + 1e-9 * rest, size=len(sent)))
+
+        return take
 
 
 def _trace(content: Content, about: AboutRun, run: tuple[float, float], time: Array) -> Trace:

@@ -31,8 +31,6 @@ from experiments.recording.topics import CHUNK_BYTES, TOPICS
 _RECORD: Final = struct.Struct("<BQ")  # operation code, length of what follows
 _FOOTER: Final = struct.Struct("<QQI")  # begin of the summary and of its offsets, checksum of both
 _MESSAGE: Final = struct.Struct("<BQHIQQ")  # the same, and channel, sequence, log time, publish time of a message
-# last words of topics with messages that hold their time of arrival: a repeat of one has the same running number alone
-ARRIVALS: Final = {topic.name.rpartition("/")[2] for topic in TOPICS if topic.recorded is not topic.message}
 LAST: Final = 2**64  # [ns] later than any stamp
 PARTS: Final = "cases"  # folder beside a recording: in that of its case are its later parts
 HEAD: Final = np.dtype([("", "u1"), ("length", "<u8"), ("channel", "<u2"), ("", "<u4, <u8"), ("published", "<u8")])
@@ -319,7 +317,7 @@ def _copy(parts: Sequence[_Part], writer: Writer) -> int:
     writer.start(header.profile if header else "", header.library if header else "zenpark")
     schemas: dict[tuple[str, str, bytes], int] = {}
     channels: dict[tuple[str, int], int] = {}
-    earlier: set[tuple[int, int, int | bytes]] = set()  # messages that a later part may repeat
+    earlier: set[tuple[int, int, bytes]] = set()  # messages that a later part may repeat
     written = 0
     for number, part in enumerate(parts, 1):
         begins = _earliest(each for later in parts[number:] for each in later.begins.items())
@@ -333,11 +331,10 @@ def _copy(parts: Sequence[_Part], writer: Writer) -> int:
             if named not in channels:
                 channels[named] = writer.register_channel(each.topic, each.message_encoding, named[1], each.metadata)
             places[old] = channels[named]
-        fresh: list[tuple[int, int, int | bytes]] = []
+        fresh: list[tuple[int, int, bytes]] = []
         for message in Records(part.records.path).messages():
             channel, topic = places[message.channel], part.records.channels[message.channel].topic
-            content = message.sequence if topic.rpartition("/")[2] in ARRIVALS else message.data
-            key = (channel, message.published, content)
+            key = (channel, message.published, message.data)
             if key in earlier:
                 continue
             writer.add_message(channel, message.logged, message.data, message.published, message.sequence)

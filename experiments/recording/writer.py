@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from io import FileIO
 from math import inf
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any, Final, Literal, Self, cast
+from typing import Final, Literal, Self
 
 import msgspec
 import zstandard
@@ -37,14 +37,14 @@ from mcap.records import (
 from mcap.writer import MCAP0_MAGIC
 
 from agents.body.kinds import KINDS, RecordedKind
-from agents.network.messages import BareGoal, BarePose, Event, Goal, Pose, State, Vector
+from agents.network import messages
+from agents.network.messages import Event, Goal, Pose, State, Vector
 from experiments.definition.plan import Plan
 from experiments.recording import version
 from experiments.recording.reader import RecordingError
-from experiments.recording.ros2 import viewers
-from experiments.recording.ros2.cdr import Unencodable, codec
+from experiments.recording.ros2 import payload, viewers
 from experiments.recording.ros2.viewers import Draw
-from experiments.recording.topics import CHUNK_BYTES, JSON, KINDS_JSON, METADATA, SPOKEN, TOML, TOPICS, Message
+from experiments.recording.topics import CHUNK_BYTES, JSON, KINDS_JSON, METADATA, TOML, TOPICS, Message
 
 BLOCK_BYTES: Final = 1024 * 1024
 HEAD: Final = struct.Struct("<BQHIQQ")  # a message's record up to its data
@@ -66,9 +66,8 @@ class McapFile:
         self.full = False  # the chunk in progress has its size
         self.end = 0  # [ns] latest log time in the finished chunks
         self._file, self._size = file, chunk_bytes
-        self._chunk, self._index = RecordBuilder(), dict[int, list[int]]()  # log times [ns] and offsets, by channel
-        self._first = self._last = 0  # [ns] log times in the chunk
-        self._summary = {group: RecordBuilder() for group in GROUPS}
+        self._chunk, self._index = bytearray(), defaultdict[int, list[int]](list)  # log times [ns], offsets, by channel
+        self._summary = {group: bytearray() for group in GROUPS}
         self._indices = TemporaryFile(dir=folder)  # noqa: SIM115 - closed by `close`
         self._counted = Statistics(0, 0, Counter(), 0, 0, 0, 0, 0, 0)
 
@@ -80,86 +79,85 @@ class McapFile:
     def attach(self, name: str, kind: str, data: bytes) -> None:
         """Write an attachment."""
         offset, length = self._put(Attachment(0, 0, name, kind, data))
-        AttachmentIndex(offset, length, 0, 0, len(data), name, kind).write(self._summary[Opcode.ATTACHMENT_INDEX])
+        index = AttachmentIndex(offset, length, 0, 0, len(data), name, kind)
+        self._summary[Opcode.ATTACHMENT_INDEX] += _encoded(index)
         self._counted.attachment_count += 1
 
     def describe(self, name: str, about: dict[str, str]) -> None:
         """Write metadata."""
         offset, length = self._put(Metadata(name, about))
-        MetadataIndex(offset, length, name).write(self._summary[Opcode.METADATA_INDEX])
+        self._summary[Opcode.METADATA_INDEX] += _encoded(MetadataIndex(offset, length, name))
         self._counted.metadata_count += 1
 
     def register_schema(self, name: str, schema: str) -> int:
         """Number of a new schema, in ROS 2's language."""
         self._counted.schema_count += 1
-        made = Schema(data=schema.encode(), encoding="ros2msg", id=self._counted.schema_count, name=name)
-        for place in (self._chunk, self._summary[Opcode.SCHEMA]):
-            made.write(place)
-        return made.id
+        made = _encoded(Schema(self._counted.schema_count, schema.encode(), "ros2msg", name))
+        self._chunk += made
+        self._summary[Opcode.SCHEMA] += made
+        return self._counted.schema_count
 
     def register_channel(self, topic: str, schema: int) -> int:
         """Number of a new channel of messages in CDR."""
         self._counted.channel_count += 1
-        made = Channel(self._counted.channel_count, topic, "cdr", {}, schema)
-        for place in (self._chunk, self._summary[Opcode.CHANNEL]):
-            made.write(place)
-        return made.id
+        made = _encoded(Channel(self._counted.channel_count, topic, "cdr", {}, schema))
+        self._chunk += made
+        self._summary[Opcode.CHANNEL] += made
+        return self._counted.channel_count
 
     def add(self, channel: int, logged: int, data: bytes, stamp: int, number: int) -> None:
         """Add a message with its log time and stamp [ns] to the chunk in progress."""
-        self._first = min(self._first, logged) if self._index else logged
-        self._last = max(self._last, logged)
-        offset, length = self._chunk.count, len(data) + HEAD.size
-        self._index.setdefault(channel, []).extend((logged, offset))
+        offset, length = len(self._chunk), len(data) + HEAD.size
         # its opcode and the length itself, 9 bytes, are not in the length
-        self._chunk.write(HEAD.pack(Opcode.MESSAGE, length - 9, channel, number, logged, stamp) + data)
+        self._chunk += HEAD.pack(Opcode.MESSAGE, length - 9, channel, number, logged, stamp)
+        self._chunk += data
+        self._index[channel] += (logged, offset)
         self.full = offset + length > self._size
 
     def flush(self) -> None:
         """Write the chunk in progress, unless it is without messages."""
         if not self._index:
             return
-        data = self._chunk.end()
+        data, times = bytes(self._chunk), [time for numbers in self._index.values() for time in numbers[::2]]
         packed, size = zstandard.compress(data), len(data)
-        offset, length = self._put(Chunk("zstd", packed, self._last, self._first, zlib.crc32(data), size))
-        begin, indices = self._file.tell(), RecordBuilder()
+        first, last = min(times), max(times)
+        offset, length = self._put(Chunk("zstd", packed, last, first, zlib.crc32(data), size))
+        begin, indices = self._file.tell(), bytearray()
         offsets = dict[int, int]()
         for channel, numbers in self._index.items():
-            offsets[channel] = begin + indices.count
+            offsets[channel] = begin + len(indices)
             head = (Opcode.MESSAGE_INDEX, 6 + 8 * len(numbers), channel, 8 * len(numbers))
-            indices.write(struct.pack(f"<BQHI{len(numbers)}Q", *head, *numbers))
+            indices += struct.pack(f"<BQHI{len(numbers)}Q", *head, *numbers)
             self._counted.channel_message_counts[channel] += len(numbers) // 2
-            self._counted.message_count += len(numbers) // 2
-        written, record = indices.end(), RecordBuilder()
-        self._file.write(written)
-        ChunkIndex(length, offset, "zstd", len(packed), self._last, len(written), offsets, self._first, size).write(
-            record
-        )
-        self._indices.write(record.end())
+        self._file.write(indices)
+        index = ChunkIndex(length, offset, "zstd", len(packed), last, len(indices), offsets, first, size)
+        self._indices.write(_encoded(index))
         counted = self._counted
-        first = min(counted.message_start_time, self._first) if counted.chunk_count else self._first
-        counted.message_start_time, counted.message_end_time = first, max(counted.message_end_time, self._last)
+        counted.message_count += len(times)
+        counted.message_start_time = min(counted.message_start_time, first) if counted.chunk_count else first
+        counted.message_end_time = max(counted.message_end_time, last)
         counted.chunk_count += 1
-        self.end = max(self.end, self._last)
-        self._last, self.full = 0, False
+        self.end = max(self.end, last)
+        self.full = False
+        self._chunk.clear()
         self._index.clear()
 
     def finish(self) -> None:
         """Write the last chunk and the summary."""
         self.flush()
         self._put(DataEnd(0))
-        self._counted.write(self._summary[Opcode.STATISTICS])
+        self._summary[Opcode.STATISTICS] += _encoded(self._counted)
         begin, sum_ = self._file.tell(), 0
-        offsets = RecordBuilder()
+        offsets = bytearray()
         self._indices.seek(0)
         for group in GROUPS:
-            start, kept = self._file.tell(), self._summary[group].end()
+            start, kept = self._file.tell(), self._summary[group]
             for block in iter(partial(self._indices.read, BLOCK_BYTES), b"") if group == Opcode.CHUNK_INDEX else [kept]:
                 self._file.write(block)
                 sum_ = zlib.crc32(block, sum_)
-            SummaryOffset(group, start, self._file.tell() - start).write(offsets)
+            offsets += _encoded(SummaryOffset(group, start, self._file.tell() - start))
         # the footer's sum of the summary covers its own fields before that sum
-        end = offsets.end() + struct.pack("<BQQQ", Opcode.FOOTER, 20, begin, self._file.tell())
+        end = offsets + struct.pack("<BQQQ", Opcode.FOOTER, 20, begin, self._file.tell())
         self._file.write(end + struct.pack("<I", zlib.crc32(end, sum_)) + MCAP0_MAGIC)
 
     def close(self) -> None:
@@ -170,9 +168,13 @@ class McapFile:
 
     def _put(self, record: McapRecord) -> tuple[int, int]:
         """Write a record; return where it begins, and its length."""
-        built, offset = RecordBuilder(), self._file.tell()
-        record.write(built)
-        return offset, self._file.write(built.end())
+        return self._file.tell(), self._file.write(_encoded(record))
+
+
+def _encoded(record: McapRecord) -> bytes:
+    builder = RecordBuilder()
+    record.write(builder)
+    return bytes(builder.end())
 
 
 DRAWN: Final = "/{robot}/true_pose"
@@ -185,11 +187,23 @@ ROUNDING_S: Final = 1e-6
 LATEST_S: Final = 2.0**32  # a stamp beyond (the year 2106) is a broken clock; nanoseconds of it may not fit the file
 
 
-BARE: Final = {Pose: len(BarePose.__struct_fields__), Goal: len(BareGoal.__struct_fields__)}
+@dataclass(frozen=True)
+class _Written:
+    """A topic as the file has it."""
+
+    name: str  # name with `{robot}` for the robot's name
+    kind: str  # the ROS 2 type
+    schema: str
+
+    @cached_property
+    def of_robot(self) -> bool:
+        """Whether each robot has its own."""
+        return "{robot}" in self.name
 
 
-def _spoken(message: Message) -> dict[str, Any]:
-    return {"shared": message.shared} if isinstance(message, Pose) and message.shared else {}
+POSES: Final = _Written(DRAWN, viewers.POSE, viewers.POSE_SCHEMA)
+TRANSFORMS: Final = _Written(FRAMES, viewers.TF, viewers.TF_SCHEMA)
+SCENES: Final = _Written(SCENE, viewers.MARKERS, viewers.MARKERS_SCHEMA)
 
 
 class Recording:
@@ -219,8 +233,7 @@ class Recording:
             chunk_bytes: Messages that are written together, and lost together by a kill [bytes].
         """
         self.path = path
-        self.refused = 0  # messages left out, because they hold what their type excludes
-        self._channels: dict[tuple[str, str], int] = {}  # channels by topic and robot, if the topic is of one
+        self._channels: dict[tuple[str, str, str], int] = {}  # channels by type, topic, and robot where it has its own
         self._schemas: dict[str, int] = {}
         self._stamp = -inf  # [s, UTC] the last good one
         self._latest = 0  # [ns] the same
@@ -228,17 +241,13 @@ class Recording:
         self._places: dict[str, Vector] = {}  # [m] place of each robot, the last known
         self._framed: dict[str, float] = {}  # [s, UTC] stamp of its last transform, by robot
         self._scene_at = -inf  # [s, UTC]
+        self._chosen = plan.experiment.network.encoding
+        self._kinds = {topic.message: topic for topic in TOPICS}
         self._topics = {
-            topic: (topic.recorded, _Written(topic.name, made.name, made.schema, made.encode))
-            for topic in TOPICS
-            for made in [codec(topic.recorded)]
+            (kind, each): _Written(topic.name, payload.type_name(kind, each), payload.schema(kind, each))
+            for kind, topic in self._kinds.items()
+            for each in payload.NAMES
         }
-        self._topic_of = {topic.message: topic for topic in TOPICS if topic is not SPOKEN}
-        self._drawn = _Written(DRAWN, viewers.POSE, viewers.POSE_SCHEMA, viewers.pose)
-        self._frames = _Written(FRAMES, viewers.TF, viewers.TF_SCHEMA, viewers.transform)
-        self._scene = _Written(
-            SCENE, viewers.MARKERS, viewers.MARKERS_SCHEMA, lambda drawn: viewers.markers(self._scene_at, drawn)
-        )
         self._over = ""  # why nothing more can be written
         try:
             file = _Unbuffered(path, "xb")
@@ -266,35 +275,33 @@ class Recording:
             self._file.close()
             raise
 
-    def write(self, message: Message, received: float | None = None, size: int = 0) -> None:
+    def write(
+        self, message: Message, data: bytes | None = None, mime: str = "", *, logged: float | None = None
+    ) -> None:
         """Records a message. An event brings everything so far to the disk: events are few, and explain the rest.
 
         With a state, its place goes to the viewers' topics if it is known: the truth of a twin, else as measured.
 
         Args:
-            received: When the recorder got it, UTC [s]; of poses and goals.
-            size: Of its payload on the network [bytes]; of poses and goals.
+            data: Its payload on the network; None: the message is encoded.
+            mime: MIME type of the payload; empty: that of the experiment.
+            logged: Log time, UTC [s]. None: a pose or a goal is logged when it came, other messages at their stamps.
 
         Raises:
             RecordingError: If it cannot be written; what was written before stays.
         """
-        chosen, entry = self._topic_of[type(message)], cast(Any, message)
-        if isinstance(message, Pose) and message.shared:
-            chosen = SPOKEN
-        recorded, topic = self._topics[chosen]
-        if received is not None:
-            values = msgspec.structs.astuple(message)
-            if isinstance(message, Pose | Goal):
-                values = values[: BARE[type(message)]]
-            entry = recorded(*values, received=received, size=size, **_spoken(message))
-        logged = message.stamp if received is None else received
-        if self._utc is not None and received is None:
-            now = self._utc()
-            logged = min(now, max(now - LATE_S, logged))
-        written = self._record(topic, message, entry, logged)
+        kind = type(message)
+        encoding = messages.encoding_of(mime) if mime else self._chosen if self._kinds[kind].packed else "json"
+        if data is None:
+            data = messages.encode(message, encoding)
+        if logged is None:
+            logged = message.stamp
+            if self._utc is not None:
+                now = self._utc()
+                logged = now if kind in (Pose, Goal) else min(now, max(now - LATE_S, logged))
+        self._add(self._topics[kind, encoding], message, payload.wrap(data, encoding), logged)
         if isinstance(message, State):
-            if written:
-                self._show(message, logged)
+            self._show(message, logged)
         elif isinstance(message, Event):
             self.flush()
 
@@ -303,15 +310,16 @@ class Recording:
         place = state.position if state.true_position is None else state.true_position
         if place is None:
             return
-        self._record(self._drawn, state, state, logged)
-        self._places[state.robot] = place
-        if not -FRAMES_S < logged - self._framed.get(state.robot, -inf) < FRAMES_S - ROUNDING_S:
-            self._framed[state.robot] = logged
-            self._record(self._frames, state, state, logged)
-        if self._draw is not None and not -SCENE_S < logged - self._scene_at < SCENE_S - ROUNDING_S:
-            self._scene_at = logged
-            drawn = self._draw(logged, self._places)
-            self._record(self._scene, state, drawn, logged)
+        with suppress(viewers.Unencodable):
+            self._add(POSES, state, viewers.pose(state), logged)
+            self._places[state.robot] = place
+            if not -FRAMES_S < logged - self._framed.get(state.robot, -inf) < FRAMES_S - ROUNDING_S:
+                self._framed[state.robot] = logged
+                self._add(TRANSFORMS, state, viewers.transform(state), logged)
+            if self._draw is not None and not -SCENE_S < logged - self._scene_at < SCENE_S - ROUNDING_S:
+                self._scene_at = logged
+                drawn = viewers.markers(logged, self._draw(logged, self._places))
+                self._add(SCENES, state, drawn, logged)
 
     def flush(self) -> None:
         """Brings everything so far to the disk."""
@@ -342,16 +350,10 @@ class Recording:
         self._file.attach(KINDS_JSON, "application/json", msgspec.json.encode(figures))
         self._file.describe(METADATA, about)
 
-    def _record(self, topic: _Written, message: Message, entry: object, logged: float) -> bool:
-        """Write a message; False if it could not be encoded."""
-        try:
-            data = topic.encode(entry)
-        except Unencodable:
-            self.refused += 1
-            return False
+    def _add(self, topic: _Written, message: Message, data: bytes, logged: float) -> None:
         # one channel for each topic: readers that look a topic up take the first of its channels alone
-        robot = getattr(message, "robot", "") if "{robot}" in topic.name else ""
-        channel = self._channels.get((topic.name, robot)) or self._register(topic, robot)
+        robot = getattr(message, "robot", "") if topic.of_robot else ""
+        channel = self._channels.get((topic.kind, topic.name, robot)) or self._register(topic, robot)
         begun = self._nanoseconds(logged)
         stamp = begun if message.stamp == logged else self._nanoseconds(message.stamp)
         number = getattr(message, "seq", 0) & 0xFFFFFFFF
@@ -365,18 +367,18 @@ class Recording:
             raise
         if self._file.full:
             self.flush()
-        return True
 
     def _register(self, topic: _Written, robot: str) -> int:
         if topic.kind not in self._schemas:
             self._schemas[topic.kind] = self._file.register_schema(topic.kind, topic.schema)
         channel = self._file.register_channel(topic.name.format(robot=robot), self._schemas[topic.kind])
-        self._channels[topic.name, robot] = channel
+        self._channels[topic.kind, topic.name, robot] = channel
         return channel
 
     def _nanoseconds(self, stamp: float) -> int:
         if stamp != self._stamp and 0.0 <= stamp < LATEST_S:
-            self._stamp, self._latest = stamp, round(stamp * 1e9)
+            seconds = int(stamp)  # apart: nanoseconds since 1970 are more digits than a float has
+            self._stamp, self._latest = stamp, seconds * 10**9 + round((stamp - seconds) * 1e9)
         return self._latest  # a broken clock must not stretch the time line of the whole file
 
     def _write_or_fail(self, write: Callable[..., object], *what: object) -> None:
@@ -400,20 +402,10 @@ class Recording:
         return f"{self.path}: the recorder was interrupted while it wrote; `./zenpark export` repairs the file"
 
 
-@dataclass(frozen=True)
-class _Written:
-    """A topic as the file has it."""
-
-    name: str  # name with `{robot}` for the robot's name
-    kind: str  # the ROS 2 type
-    schema: str
-    encode: Callable[[Any], bytes]
-
-
 class _Unbuffered(FileIO):
     """An unbuffered file: a write is the kernel's when it returns, so that a kill loses none of it."""
 
-    def write(self, data: bytes) -> int:  # type: ignore[override]
+    def write(self, data: bytes | bytearray) -> int:  # type: ignore[override]
         rest = memoryview(data)
         while rest:  # a disk that is nearly full takes a part, and refuses only the next
             rest = rest[super().write(rest) :]

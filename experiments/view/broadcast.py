@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,13 +23,12 @@ from agents.network.name_ownership import NameTaken, OwnershipCheck, claim
 from experiments.file import document
 from experiments.recording.playback import AboutRun, topic_of
 from experiments.recording.reader import RecordingError, Records
-from experiments.recording.ros2.cdr import Undecodable, codec
+from experiments.recording.ros2 import payload
 from experiments.recording.topics import Topic
 from experiments.view.replay import ReplayClock
 
 STEP_S: Final = 0.01
 SEEN_S: Final = 1.0  # time until the tokens of a run that is up have come
-ENCODED: Final = (messages.State, messages.Status, messages.Pose, messages.Goal)  # the rest is JSON
 
 
 class Broadcast:
@@ -40,13 +40,15 @@ class Broadcast:
         `watch_s` is how long it looks for others in the realm before it plays.
         """
         records = Records(path)
-        self._topics: dict[int, Topic | None] = {}  # topics by channel
+        topics: dict[int, tuple[Topic, messages.Encoding] | None] = {}  # topics and encodings by channel
         self._sent: list[tuple[int, int, bytes]] = []  # log time [ns], channel, data
         for message in records.messages():
-            if message.channel not in self._topics:
-                self._topics[message.channel] = topic_of(records, message.channel)
-            if self._topics[message.channel] is not None:
+            if message.channel not in topics:
+                topics[message.channel] = topic_of(records, message.channel)
+            if topics[message.channel] is not None:
                 self._sent.append((message.logged, message.channel, message.data))
+        self._topics = {channel: found for channel, found in topics.items() if found is not None}
+        self._channels = records.channels
         self._sent.sort(key=lambda each: each[0])
         about = AboutRun.of(records)
         self.plan, self.case = about.plan, about.case
@@ -108,27 +110,19 @@ class Broadcast:
         return count
 
     def _send(self, channel: int, data: bytes) -> None:
-        topic = self._topics[channel]
-        assert topic is not None
-        try:
-            entry: Any = codec(topic.recorded).decode(data)
-        except Undecodable:
-            return
-        if topic.recorded is not topic.message:  # less what the recorder added
-            entry = topic.message(
-                **{name: getattr(entry, name) for name in topic.message.__struct_fields__ if hasattr(entry, name)}
-            )
-        encoding: messages.Encoding = self.plan.experiment.network.encoding if topic.message in ENCODED else "json"
-        key = topic.key(self.keys).replace("*", getattr(entry, "robot", ""))
+        topic, encoding = self._topics[channel]
+        robot = self._channels[channel].topic.removeprefix("/").partition("/")[0]
+        key, mime = topic.key(self.keys).replace("*", robot), messages.MIME[encoding]
         publisher = self._publishers.get(key)
         if publisher is None:
-            mime, kept = messages.MIME[encoding], pubsub.EVENTS if topic.message is messages.Event else 1
+            kept = pubsub.EVENTS if topic.message is messages.Event else 1
             publisher = self._publishers[key] = (
                 pubsub.pose_publisher(self._session, key, mime, kept)
                 if topic.repeated
                 else pubsub.publisher(self._session, key, mime)
             )
-        publisher.put(messages.encode(entry, encoding))
+        with suppress(messages.Malformed):
+            publisher.put(payload.unwrap(data, encoding))
 
 
 def _occupied(keys: Keys, tokens: set[str]) -> str:

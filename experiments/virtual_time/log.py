@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property
 from itertools import accumulate, pairwise, repeat
-from operator import itemgetter
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -124,24 +124,20 @@ class RunRecorder:
             draw=markers.drawing(self._plan),
             chunk_bytes=LARGE_CHUNK_BYTES,
         ) as recording:
-            for logged, message, size in heapq.merge(*self._messages(), key=itemgetter(0)):
-                if size is None:
-                    recording.write(message)
-                else:
-                    recording.write(message, logged, size)
+            for message in heapq.merge(*self._messages(), key=attrgetter("stamp")):
+                recording.write(message)
 
-    def _messages(self) -> Iterator[Iterable[tuple[float, Message, int | None]]]:
-        """All messages, those of a kind in order of time: when each is logged [s, UTC], and its size if it was sent."""
-        yield [(EPOCH + t, messages.Event(EPOCH + t, *said), None) for t, *said in self._events()]
-        yield ((pose.stamp, pose, len(messages.encode(pose, self._encoding))) for pose in self._poses(self._log.sent))
-        yield ((each.stamp, each, None) for each in self._memories())
-        yield ((state.stamp, state, None) for _, states in self._states() for state in states)
+    def _messages(self) -> Iterator[Iterable[Message]]:
+        """All messages, those of a kind in order of time."""
+        yield [messages.Event(EPOCH + t, *said) for t, *said in self._events()]
+        yield self._poses(self._log.sent)
+        yield self._memories()
+        yield (state for _, states in self._states() for state in states)
         if self._log.centre is not None and self.goals is not None:
-            goals = self._goal_messages(self._log.centre)
-            yield ((EPOCH + t, goal, len(messages.encode(goal, self._encoding))) for t, goal in goals)
-            yield [(EPOCH + self._experiment.duration_s, self._centre_report(self.goals), None)]
+            yield (goal for _, goal in self._goal_messages(self._log.centre))
+            yield [self._centre_report(self.goals)]
         for rare in (self.statuses(), self._world(), self._contacts()):
-            yield sorted(((each.stamp, each, None) for each in rare), key=itemgetter(0))
+            yield sorted(rare, key=attrgetter("stamp"))
 
     @property
     def _encoding(self) -> messages.Encoding:

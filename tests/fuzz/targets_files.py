@@ -45,9 +45,7 @@ from experiments.file.text import decoded
 from experiments.recording import bundle, playback
 from experiments.recording import writer as recording
 from experiments.recording.reader import RecordingError, recover
-from experiments.recording.ros2.cdr import Undecodable, Unencodable, codec
 from experiments.recording.run_folder import METRICS, ORIGIN, SOURCE, differences, past_runs
-from experiments.recording.topics import SentGoal, SentPose
 from experiments.sweep import store
 from experiments.sweep.plan import arguments, cells, seeds_of
 from experiments.sweep.runs import RunMetrics
@@ -226,7 +224,7 @@ def recording_of_a_second():
                 at = began + 0.1 * k
                 for said in (good("KH01", k + 1), good("CF01", k + 1)):
                     writer.write(msgspec.structs.replace(said["state"][0], stamp=at))
-                    writer.write(msgspec.structs.replace(said["pose"][0], stamp=at), at, 150)
+                    writer.write(msgspec.structs.replace(said["pose"][0], stamp=at))
                     writer.write(msgspec.structs.replace(said["status"][0], stamp=at, started=began))
             writer.write(wire.Event(began, "start", "conductor", "go"))
             writer.write(wire.Contact(began + 0.5, "KH01", "CF01", 0.1, 0.01))
@@ -286,29 +284,6 @@ def damaged_recording():
 def forged_recording():
     """Its checksums made good."""
     return recordings([unpacked(recording_of_a_second())], resealed)
-
-
-@place(50_000, 500)
-def cdr():
-    """Every recorded struct: name and CDR with a zero byte between them; what is decoded can be encoded."""
-    said = good("KH01")
-    pose = said["pose"][0]
-    fields = [getattr(pose, name) for name in ("robot", "seq", "stamp", "position", "velocity", "yaw")]
-    made = [
-        said["state"][0], said["state"][1], said["status"][0], SentPose(*fields, received=1.0, size=150),
-        *(of_all()[key][0] for key in (KEYS.event, KEYS.contact, KEYS.world, KEYS.centre, KEYS.clock)),
-        SentGoal("KH01", 1, 1.0, (0.0, 0.0, 0.0), None, 0.9, received=1.0, size=150),
-    ]  # fmt: skip
-    codecs = {type(each).__name__: codec(type(each)) for each in made}
-    names = list(codecs)
-    examples = [type(each).__name__.encode() + b"\0" + codec(type(each)).encode(each) for each in made]
-
-    def take(data):
-        name, payload = split(data)
-        chosen = codecs.get(name) or codecs[names[len(data) % len(names)]]
-        chosen.encode(chosen.decode(payload))
-
-    yield Target(examples, take, (Undecodable, Unencodable))
 
 
 @place(10_000)

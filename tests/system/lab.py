@@ -1,6 +1,7 @@
 """A run as a test sees it: real processes, a real router, and a session of the test's own to look and to order."""
 
 import contextlib
+import json
 import os
 import re
 import signal
@@ -8,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import psutil
@@ -57,10 +59,20 @@ def in_lab(folder):
 
 
 def typed(file, topic):
-    """Messages of a topic, as another library decodes them from the schema in the file."""
+    """Messages of a topic, as another library decodes them from the schema in the file.
+
+    Payloads of the network have their fields as attributes, with `logged` [s, UTC].
+    """
     with file.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        return [message for *_, message in reader.iter_decoded_messages([topic])]
+        found = [(one.message.log_time, one.decoded_message) for one in reader.iter_decoded_messages([topic])]
+    return [_with_fields(each, at / 1e9) if hasattr(each, "data") else each for at, each in found]
+
+
+def _with_fields(message, logged):
+    fields = json.loads(message.data, object_hook=lambda part: SimpleNamespace(**part))
+    fields.logged = logged
+    return fields
 
 
 class Watcher:

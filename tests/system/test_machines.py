@@ -122,7 +122,7 @@ def test_one_command_flies_reference_and_fetches_all_files(lab, tmp_path):
     begun = [desk.typed(f"/{robot}/status")[-1].started for robot in read.trace.robots]
     assert np.ptp(begun) < 1e-5
     poses = [desk.typed(f"/{robot}/pose") for robot in read.trace.robots]
-    under_way = [min(pose.received - pose.stamp for pose in several) for several in poses]
+    under_way = [min(pose.logged - pose.stamp for pose in several) for several in poses]
     doubt = max(lie.uncertainty for lie in lies.values())  # of a busy machine: how well its clocks could be compared
     assert np.ptp(under_way) < 5e-3 + doubt
     assert -doubt < min(under_way) < 5e-3 + doubt
@@ -294,5 +294,5 @@ def test_robots_follow_a_clock_that_drifts_meanwhile(lab, tmp_path):
             started = {each.started for each in desk.typed(f"/{robot}/status") if each.phase == "running"}
             assert len(started) == 1, "the start stays"
             poses = desk.typed(f"/{robot}/pose")
-            late = [pose.received - pose.stamp for pose in poses if pose.stamp > poses[-1].stamp - 3.0]
+            late = [pose.logged - pose.stamp for pose in poses if pose.stamp > poses[-1].stamp - 3.0]
             assert min(late) > -0.5 * gained - doubt, "a stamp of tomorrow, if nobody had followed"

@@ -24,7 +24,7 @@ from agents.network.messages import M
 from agents.network.shutdown import AFTER_S, end
 from agents.runtime import command_line
 from experiments.real_time.processes.joining import Launch, joined
-from experiments.recording.topics import DEPTH, RARE, SPOKEN, TOPICS, Message, Topic
+from experiments.recording.topics import DEPTH, RARE, TOPICS, Message, Topic
 from experiments.recording.writer import Recording
 from experiments.scene import markers
 
@@ -40,16 +40,16 @@ class Recorder:
     def __init__(self, session: zenoh.Session, keys: Keys, recording: Recording) -> None:
         self._keys, self._recording = keys, recording
         self._session = session
-        self._arrival = Clock()
+        self._utc = Clock().utc
         self.unread: dict[str, tuple[int, str]] = {}  # number by key, and why the last
         self._reported: dict[str, int] = {}
         self.alive: set[str] = set()  # tokens of the robots that are left
-        topics = [topic for topic in TOPICS if topic is not SPOKEN]
-        self._inboxes = [(topic, self._inbox(self._subscribe(topic), topic.message)) for topic in topics]
+        self._inboxes = [(topic, self._inbox(self._subscribe(topic), topic.message)) for topic in TOPICS]
         self._world_events = self._inbox(pubsub.subscriber(session, keys.world_event, RARE), messages.Event)
         self._truths = self._inbox(pubsub.subscriber(session, keys.truth("*"), DEPTH), messages.Position)
         self._truth: dict[str, deque[messages.Position]] = {}
-        self._waiting: dict[str, deque[tuple[float, messages.State]]] = {}  # states that wait for truth, since when
+        # states that wait for truth: since when [s, monotonic], and the MIME types of their payloads
+        self._waiting: dict[str, deque[tuple[float, messages.State, str]]] = {}
         self._watch = pubsub.AliveWatch(session, keys.alive("*"))
         self._token = pubsub.alive_token(session, keys.recorder)
 
@@ -61,14 +61,15 @@ class Recorder:
             self._store_truth(truth)
         for topic, inbox in self._inboxes:
             for message, sample in inbox.read_samples(_require_finite if topic.finite else None):
-                self._store(topic, message, len(sample.payload))
+                self._store(message, sample)
         for event in self._world_events.read(validation.check_world_event):
             self._recording.write(event)
         now = time.monotonic()
         for robot, waiting in self._waiting.items():
             truths = self._truth[robot]
             while waiting and (last or waiting[0][1].stamp <= truths[-1].stamp or now - waiting[0][0] > PATIENCE_S):
-                self._recording.write(with_truth(waiting.popleft()[1], truths))
+                _, state, mime = waiting.popleft()
+                self._recording.write(with_truth(state, truths), mime=mime)
 
     def report_malformed(self, *, last: bool = False) -> None:
         """Records unreadable messages as events: of each key the first, and their number the `last` time."""
@@ -77,7 +78,7 @@ class Recorder:
             if not before or (last and count != before):
                 self._reported[key] = count
                 text = f"could not read {count} {'message' if count == 1 else 'messages'} on {key}: {why}"
-                self._recording.write(messages.Event(self._arrival.utc(), "unread", "recorder", text))
+                self._recording.write(messages.Event(self._utc(), "unread", "recorder", text))
 
     def _inbox(self, subscription: pubsub.Subscription, kind: type[M]) -> pubsub.Inbox[M]:
         keys = self._keys if "robot" in kind.__struct_fields__ else None
@@ -93,13 +94,12 @@ class Recorder:
     def _note_unread(self, key: str, reason: str) -> None:
         self.unread[key] = self.unread.get(key, (0, ""))[0] + 1, reason
 
-    def _store(self, topic: Topic, message: Message, size: int) -> None:
+    def _store(self, message: Message, sample: zenoh.Sample) -> None:
+        mime = str(sample.encoding)
         if isinstance(message, messages.State) and message.true_position is None and message.robot in self._truth:
-            self._waiting.setdefault(message.robot, deque()).append((time.monotonic(), message))
-        elif topic.recorded is topic.message:
-            self._recording.write(message)
+            self._waiting.setdefault(message.robot, deque()).append((time.monotonic(), message, mime))
         else:
-            self._recording.write(message, self._arrival.utc(), size)
+            self._recording.write(message, sample.payload.to_bytes(), mime)
 
     def _store_truth(self, truth: messages.Position) -> None:
         """Stores the true pose that a protocol twin publishes: its bridge cannot know it."""

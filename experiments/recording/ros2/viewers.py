@@ -14,13 +14,14 @@ from itertools import chain
 from typing import Final
 
 from agents.network.messages import Setpoint, State, Vector
-from experiments.recording.ros2.cdr import LITTLE_ENDIAN, SEPARATOR, Unencodable
+from experiments.recording.ros2.payload import LITTLE_ENDIAN
 
 FRAME: Final = "map"  # the arena, as RViz and Nav2 name the fixed frame; the ROS 2 bridge says the same
 
 TF: Final = "tf2_msgs/msg/TFMessage"
 MARKERS: Final = "visualization_msgs/msg/MarkerArray"
 POSE: Final = "geometry_msgs/msg/PoseStamped"
+SEPARATOR: Final = "=" * 80 + "\n"
 _HEADER: Final = (
     "MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n",
     "MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n",
@@ -70,6 +71,10 @@ CUBE, CYLINDER, LINE_STRIP, LINE_LIST, TEXT = 1, 3, 4, 5, 9  # types of a marker
 Colour = tuple[int, int, int]
 Draw = Callable[[float, dict[str, Vector]], "Sequence[Marker]"]  # asks for the time [s, UTC] and the places [m]
 LEVEL: Final[Setpoint] = (1.0, 0.0, 0.0, 0.0)  # quaternion w, x, y, z
+
+
+class Unencodable(ValueError):
+    """A number that its ROS 2 type cannot hold."""
 
 
 @dataclass(frozen=True)

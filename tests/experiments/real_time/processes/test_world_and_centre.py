@@ -322,6 +322,16 @@ def test_centre_with_clock_behind_is_followed():
     assert not guidance.unguided(2.3)
 
 
+class Taken:
+    """Recording that keeps messages in a list."""
+
+    def __init__(self, kept):
+        self._kept = kept
+
+    def write(self, message, *_payload):
+        self._kept.append(message)
+
+
 def test_recorder_keeps_plausible_messages_of_the_world():
     lost = messages.ObstaclePose("box", (0.0, math.nan, 0.0))
     said = [
@@ -335,7 +345,7 @@ def test_recorder_keeps_plausible_messages_of_the_world():
     ]
     taken = []
     with Net().worn() as net:
-        recorder = Recorder(net.session, KEYS, types.SimpleNamespace(write=taken.append))
+        recorder = Recorder(net.session, KEYS, Taken(taken))
         for key, message in said:  # MessagePack keeps what is not finite; JSON would say null
             net.deliver(sent(key, message)[1])
         recorder.receive()
@@ -354,11 +364,7 @@ def test_world_speaks_for_itself_alone():
     for reader in ("recorder", "view"):
         with Net().worn() as net:
             taken = []
-            made = (
-                Recorder(net.session, KEYS, types.SimpleNamespace(write=taken.append))
-                if reader == "recorder"
-                else Observer(net.session, KEYS)
-            )
+            made = Recorder(net.session, KEYS, Taken(taken)) if reader == "recorder" else Observer(net.session, KEYS)
             for event in (forged, changed(forged, source="conductor"), told):
                 net.deliver(sent(KEYS.world_event, event)[0])
             if isinstance(made, Observer):
