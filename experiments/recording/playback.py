@@ -291,7 +291,7 @@ class Content:
         def take(message: RecordedMessage) -> None:
             sent = payload.unwrap(message.data, encoding)
             seconds, rest = divmod(message.logged, 10**9)
-            append(recorded(*astuple(decode(sent)), received=seconds + 1e-9 * rest, size=len(sent)))
+            append(recorded(*(*astuple(decode(sent)), seconds + 1e-9 * rest, len(sent))))
 
         return take
 

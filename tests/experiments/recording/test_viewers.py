@@ -36,7 +36,7 @@ def test_both_libraries_read_a_payload(kind, encoding):
     survives()
 
 
-def test_the_schema_holds_the_json_schema_of_the_payload():
+def test_schema_holds_the_payloads_json_schema():
     text = payload.schema(Pose, "json")
     assert '"robot":{"type":"string"}' in text
     assert text.endswith("}\nstring data\n")
