@@ -72,6 +72,7 @@ def serve(
         stop.set()
 
     open_now: list[zenoh.Session] = []
+    check = StuckCheck(lambda: _answers(open_now[0]))
 
     def ready(session: zenoh.Session) -> None:
         begun = bool(open_now)
@@ -79,13 +80,14 @@ def serve(
         if begun:
             return
         print(f"router ready on {', '.join(endpoints)}", flush=True)
-        StuckCheck(lambda: _answers(open_now[0]))
+        check.start()
         if lifeline:
             rope.start()
             threading.Thread(target=leave, args=(open_now,), name="linger", daemon=True).start()
 
     with on_termination(stop.set):
         serve_router(endpoints, stop, link=link, ready=ready, rights=rights)
+    check.end()
     if rope.reason is not None:
         print(f"router: {'ends with its starter' if rope.reason == GONE else rope.reason}", file=sys.stderr)
     return 0
@@ -225,23 +227,29 @@ class StuckCheck:
     """
 
     def __init__(self, ask: Callable[[], bool], end: Callable[[int], object] | None = None) -> None:
-        """Begins to `ask`, which returns whether there was an answer; `end` ends the process with an exit code."""
+        """`ask` returns whether there was an answer; `end` ends the process with an exit code."""
         self._ask, self._end = ask, end or os._exit
         self._asked = self._answered = 0  # number of questions
+        self._over = threading.Event()
+
+    def start(self) -> None:
         for each in (self._question, self._watch):
             threading.Thread(target=each, name="stuck", daemon=True).start()
 
+    def end(self) -> None:
+        self._over.set()
+
     def _question(self) -> None:
-        while True:
+        while not self._over.wait(LOOK_AGAIN_S):
             self._asked += 1
             if self._ask():
                 self._answered = self._asked
-                time.sleep(LOOK_AGAIN_S)
 
     def _watch(self) -> None:
         turns = seen = 0
         while turns * LOOK_AGAIN_S < STUCK_S:
-            time.sleep(LOOK_AGAIN_S)
+            if self._over.wait(LOOK_AGAIN_S):
+                return
             turns = turns + 1 if self._answered == seen else 0
             seen = self._answered
         print(f"router: it has not answered itself for {STUCK_S:g} s, and ends", file=sys.stderr, flush=True)

@@ -1,7 +1,10 @@
 """The fault laboratory: scripts for real processes, and its verdict."""
 
+import re
+
 from experiments.file.document import load
-from tests.reliability.chaos import KINDS, Round, findings, scripts
+from tests.conftest import ROOT
+from tests.reliability.chaos import KINDS, UNREAL, Round, findings, scripts
 
 
 def test_scripts_have_as_many_faults_as_wanted():
@@ -11,7 +14,14 @@ def test_scripts_have_as_many_faults_as_wanted():
     faults = [fault for _, script in drawn for fault in script]
     assert len(faults) == 23
     assert {fault.kind for fault in faults} <= {*KINDS}
-    assert all(fault.since == "start" and fault.at >= 0.0 for fault in faults)
+    assert "launch" not in {fault.since for fault in faults}
+
+
+def test_page_has_each_kind_of_fault_once():
+    page = (ROOT / "docs" / "chaos.md").read_text("utf-8").partition("test --chaos`\n\nRuns")[2]
+    for head, kinds in (("| kind | done by |", KINDS), ("| kind | why it is simulated alone |", UNREAL)):
+        rows = page.partition(head)[2].partition("\n\n")[0].splitlines()[2:]
+        assert {kind for row in rows for kind in re.findall(r"`(\w+)`", row.split("|")[1])} == {*kinds}
 
 
 def test_verdict_names_violations_and_other_codes():

@@ -10,6 +10,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from experiments.definition.plan import Plan
     from tests.simulated.world import World
 
 
@@ -258,6 +259,16 @@ def draw(
         if fault.kind in OF_ANY and rng.random() < 0.35:
             drawn[number] = replace(fault, who=rng.choice(others))
     return sorted(drawn, key=lambda fault: fault.at)
+
+
+def draw_for(plan: Plan, seed: int, kinds: Sequence[str] = ()) -> list[Fault]:
+    """A random script for the processes of an experiment."""
+    robots = plan.experiment.robots
+    captured = [name for name, robot in robots.items() if robot.position == "external" and robot.body != "world"]
+    others = [f"router{number}" for number in range(2, plan.experiment.network.routers + 1)]
+    others += ["centre"] * (plan.experiment.architecture == "centralised")
+    others += ["world"] * any(robot.body == "world" for robot in robots.values())
+    return draw(seed, plan.names, captured, plan.experiment.duration_s, kinds, others=others)
 
 
 def _draw_one(  # noqa: PLR0917 - as `draw`, which has made them

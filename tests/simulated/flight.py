@@ -91,13 +91,7 @@ def _script(request: Request, file: str) -> list[faults.Fault]:
     if request.drawn is None:
         return list(request.script)
     plans = load(file, *request.settings).cases()
-    plan = plans[request.case or next(iter(plans))]
-    robots = plan.experiment.robots
-    captured = [name for name, robot in robots.items() if robot.position == "external" and robot.body != "world"]
-    others = [f"router{number}" for number in range(2, plan.experiment.network.routers + 1)]
-    others += ["centre"] * (plan.experiment.architecture == "centralised")
-    others += ["world"] * any(robot.body == "world" for robot in robots.values())
-    return faults.draw(request.drawn, plan.names, captured, plan.experiment.duration_s, request.kinds, others=others)
+    return faults.draw_for(plans[request.case or next(iter(plans))], request.drawn, request.kinds)
 
 
 def mutate(mutant: Mutant) -> None:

@@ -54,7 +54,7 @@ MUTANTS = {
         test_hosts.test_killed_launcher_leaves_nobody_aloft,
     ),
     "ordered landing fails no run": (
-        f"{CONDUCTOR}conductor.py", ".startswith((LAND, STOP)):", ".startswith('nothing'):", run("landed"),
+        f"{CONDUCTOR}conductor.py", ".startswith((LAND, STOP, TOLD_TO_END)):", ".startswith('nothing'):", run("landed"),
     ),
     "second claim wins": (
         OWNERSHIP, "return other < rank if other is not None else owners and", "return False and",
@@ -134,7 +134,7 @@ MUTANTS = {
     "broken recording is no matter": (
         MEASURE, "if ended_early(trace) and not", "if False and not", run("recorder_hangs_to_the_end"),
     ),
-    "long hold is no matter": (MEASURE, "if total > HELD * end}", "if total > end}", run("held")),
+    "long hold is no matter": (MEASURE, "if ordered > HELD * end:", "if ordered > end:", run("held")),
     "suspension unnoticed": (
         LOOP, "if missed * self._dt > self._setup.loop_timeout_s:", "if missed * self._dt > 99.0:",
         test_safety.test_suspended_robot_holds_until_it_hears,

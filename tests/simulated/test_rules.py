@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from tests.simulated import rules
+from tests.simulated import look
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
-ALL = [*rules.OF_ROBOTS, *rules.OF_PAIRS, *rules.OF_COMMANDS, *rules.OF_POSES, *rules.AT_THE_END]
+ALL = [*look.OF_ROBOTS, *look.OF_PAIRS, *look.OF_COMMANDS, *look.OF_POSES, *look.AT_THE_END]
 
 
 def test_rules_quote_the_documentation():

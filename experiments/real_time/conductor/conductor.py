@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final
 
 from agents.clock import Clock
-from agents.decision.lifecycle import PAUSED
+from agents.decision.lifecycle import PAUSED, TOLD_TO_END
 from agents.network import messages
 from agents.network.keys import Keys
 from agents.runtime.orders import LAND, STOP
@@ -294,7 +294,7 @@ class Conductor(CaseRun):
         for name, view in self._robots.items():
             if view.gone or name in busy or name in known or not view.reached("landing"):
                 continue
-            if (reason := self._reason(name)).startswith((LAND, STOP)):
+            if (reason := self._reason(name)).startswith((LAND, STOP, TOLD_TO_END)):
                 when = f"after {elapsed:.1f} of {self._experiment.duration_s:g} s"
                 self._landed.setdefault((reason, when), []).append(name)
 

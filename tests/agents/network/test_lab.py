@@ -378,10 +378,15 @@ def test_members_that_do_not_read_delay_shortly(mode):
 
 
 def test_router_without_an_answer_ends_its_process(eventually):
-    for answer in (lambda: False, threading.Event().wait):
+    late, before = threading.Event(), threading.active_count()
+    for answer in (lambda: False, late.wait):
         codes = []
-        StuckCheck(answer, codes.append)
+        check = StuckCheck(answer, codes.append)
+        check.start()
         eventually(lambda: codes == [1])  # noqa: B023 - called in this turn
+        check.end()
+    late.set()
+    eventually(lambda: threading.active_count() <= before)
 
 
 def honest_tokens(name, session):

@@ -81,6 +81,7 @@ def test_standstill_without_router_halts_then_lands(experiment, after_s, on_stag
 
     stage.run(visit)
     stage.runtime.keeper.ownership.end()
+    stage.runtime.keeper.ownership._asking.join()
     landed = [at - woke[0] for at, order in stage.orders if order == "land"]
     assert landed[: len(after_s)] == pytest.approx(after_s, abs=0.05)
     assert "no router answers about the owner of its name" in stage.robot.lifecycle.reason

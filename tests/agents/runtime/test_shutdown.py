@@ -167,6 +167,8 @@ class Kennel(ManualClock):
         self.life = life
         self.dog._watch()
         self.never.set()
+        for thread in self.dog._at_work.values():
+            thread.join()
 
     def wait(self, seconds: float) -> bool:
         for what, thread in self.dog._at_work.items():

@@ -113,7 +113,8 @@ def test_a_run_that_ended_early_has_failed(landing, failures):
 
 
 @pytest.mark.parametrize(
-    ("reason", "spoilt"), [("ordered to land", True), ("ordered to stop", True), ("its battery is low", False)]
+    ("reason", "spoilt"),
+    [("ordered to land", True), ("ordered to stop", True), ("asked to end", True), ("its battery is low", False)],
 )
 def test_robot_that_was_ordered_down_spoils_the_run(reason, spoilt):
     """Any other landing is a hazard of the recording."""
@@ -507,7 +508,6 @@ def test_reason_that_counts_is_reported_once():
         ("ordered to land", (), False),
         ("ordered to leave", (), False),
         ("asked to end", (), False),
-        ("lands as its file says", (), False),
         ("emergency stop by a test", (), False),
     ],
 )
