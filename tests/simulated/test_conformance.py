@@ -4,7 +4,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from tests.simulated.conformance import SCRIPTS, RealStage, delays, differences, simulate
+from tests.simulated.conformance import RealStage, delays, differences, simulate
+from tests.simulated.network_scripts import SCRIPTS
 
 QUICK = [name for name, script in SCRIPTS.items() if script.quick]
 FAR_S = 0.3  # delays of real events, which depend on the machine, are printed from here on [s]
