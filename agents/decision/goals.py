@@ -34,7 +34,7 @@ class GoalComputer:
         # a law that is no gradient, at work; without one `law` is a gradient
         self.stepping = None if isinstance(assignment.law, Gradient) else Stepping(assignment)
         self.law = cast(Gradient, assignment.law)
-        self._anchors, self._predictor, self._changes = assignment.anchors, assignment.predictor, assignment.changes
+        self._anchors, self.predictor, self._changes = assignment.anchors, assignment.predictor, assignment.changes
         self.neighbours = Neighbours(links, assignment.limits.neighbour_timeout_s)
         self.clamp = assignment.clamp  # largest step of a goal per axis and decision [m]
         self.tracking_gain = assignment.tracking_gain  # k of (7) [1/(m² decision)]
@@ -125,7 +125,7 @@ class GoalComputer:
             if self._updating.asking.trigger.JUDGES_ERRORS:
                 self.errors(t, position)
             if not self._updating.due(
-                t, position, velocity, self.neighbours, self._predictor, max(elapsed, 0.0), offset, self.error,
+                t, position, velocity, self.neighbours, self.predictor, max(elapsed, 0.0), offset, self.error,
                 self.energy,
             ):  # fmt: skip
                 return False
@@ -150,7 +150,7 @@ class GoalComputer:
 
     def law_offset(self, t: float, position: Vector) -> Vector:
         """Offset u_i of the law and the anchors at `t` [s] for a robot at `position` [m]."""
-        law, predictor = self.law, self._predictor
+        law, predictor = self.law, self.predictor
         x = y = z = 0.0
         for sender in self.neighbours.all:
             if sender.active:
@@ -169,7 +169,7 @@ class GoalComputer:
         if self.stepping is not None:
             self.error = self.energy = nan
             return
-        law, predictor = self.law, self._predictor
+        law, predictor = self.law, self.predictor
         total = energy = 0.0
         for sender in self.neighbours.all:
             if sender.active:
@@ -204,9 +204,7 @@ class GoalComputer:
         senders = [each for each in self.neighbours.all if each.active]
         return unknown_reads(
             law,
-            lambda watched: [
-                law.pull(each.apart(position, self._predictor, t), watched(each.link)) for each in senders
-            ],
+            lambda watched: [law.pull(each.apart(position, self.predictor, t), watched(each.link)) for each in senders],
         )
 
     def view(self, t: float, position: Vector, velocity: Vector, yaw: float, start: float) -> View:
@@ -214,12 +212,13 @@ class GoalComputer:
         view = self._sight(t, position, velocity, yaw)
         if self.itinerary is not None:
             x, y, z, _ = self.itinerary.target(t - start, (position[0], position[1], self.ground), yaw)
-            cast(Stepping, self.stepping).aim(view, (x, y, z))
+            view.target = x, y, z
+            view.target_velocity = cast(Stepping, self.stepping).speed_of(view.target, view.step_s)
         return view
 
     def _sight(self, t: float, position: Vector, velocity: Vector, yaw: float) -> View:
         """View without the target of the plan."""
-        stepping, predictor = cast(Stepping, self.stepping), self._predictor
+        stepping, predictor = cast(Stepping, self.stepping), self.predictor
         view = stepping.view()
         view.position, view.velocity, view.yaw = position, velocity, yaw
         view.leads = not self.follows
@@ -276,7 +275,7 @@ class GoalComputer:
                 continue
             if self._changes:
                 changed |= change_target(sender.link, given, self._changes, sender.targets, elapsed)
-            a, b, c = sender.place(self._predictor, t)
+            a, b, c = sender.place(self.predictor, t)
             apart = norm((position[0] - a, position[1] - b, position[2] - c))
             reach = sender.release if sender.present else sender.reach
             sender.present = exists(sender.since, sender.until, reach, elapsed, apart)

@@ -15,7 +15,7 @@ from agents.network.validation import ENORMOUS, MAX_NUMBERS
 from agents.plugins.calls import failure, wrong
 from agents.plugins.law import Control, Law, Memory, RobotFacts, Said, Values, View, is_known
 from agents.plugins.registry import FAILURES, PluginError
-from agents.vectors import UNKNOWN, Vector, is_finite
+from agents.vectors import UNKNOWN, ZERO, Vector, is_finite
 
 Words = tuple[tuple[str, Values], ...]  # what a robot says beside its pose: variables by name
 
@@ -34,29 +34,26 @@ class Speech:
     def __init__(self, law: Law, memory: Memory) -> None:
         self._metres = {name: said.metre for name, said in law.SAYS.items()}
         self.now: dict[str, Values] = {}
-        self._before = self.now  # variables as said last, unless the present ones are said
-        self._current = True  # the present variables are said; at first as they begin
+        self.before = self.now  # variables as said last, unless the present ones are said
+        self.current = True  # the present variables are said; at first as they begin
         self.update(memory)
-        self.spoken = self._stepped = False  # it has said something
-        self._current = True
+        self.spoken = self.stepped = False  # it has said something
+        self.current = True
 
     def update(self, memory: Memory) -> None:
         """The variables are these after a step."""
-        if self._current:
-            self._before = self.now
-        self._stepped, self._current = True, False
+        if self.current:
+            self.before = self.now
+        self.stepped, self.current = True, False
         self.now = {name: tuple(map(rounded, memory[name])) for name in self._metres}
-        self._change = 0.0  # largest deviation of a variable from what was said, in metres; infinite if one is new
+        self.change = 0.0  # largest deviation of a variable from what was said, in metres; infinite if one is new
         for name, metre in self._metres.items():
-            now, said = self.now[name], self._before.get(name, ())
-            if is_known(now):
-                new = not said or not is_known(said)
-                self._change = inf if new else max(self._change, dist(now, said) / metre)
+            self.change = deviation(self.change, self.now[name], self.before.get(name, ()), metre)
 
     @property
     def said(self) -> Memory:
         """Variables as said last; at first as they begin."""
-        return self.now if self._current else self._before
+        return self.now if self.current else self.before
 
     @property
     def words(self) -> Words:
@@ -66,30 +63,30 @@ class Speech:
     @property
     def fresh(self) -> Words:
         """Variables that a transmission says now, those that are known."""
-        return _known(self.now) if self._stepped else ()
+        return _known(self.now) if self.stepped else ()
 
     def deviation(self, of_pose: float) -> float:
         """Largest deviation of what neighbours know, of pose and variables [m]; infinite if one is new. Quiet."""
-        if not self._stepped:
+        if not self.stepped:
             return of_pose
-        return max(of_pose, self._change) if self.spoken else inf
+        return max(of_pose, self.change) if self.spoken else inf
 
     def record(self) -> None:
         """Note that the present words are transmitted now. Quiet."""
-        if self._stepped:
-            self.spoken = self._current = True
-            self._change = 0.0
+        if self.stepped:
+            self.spoken = self.current = True
+            self.change = 0.0
 
 
 class Stepping:
     """A law at work for one robot."""
 
-    RARE: ClassVar = ("_law", "_target", "control", "facts", "scan")
+    RARE: ClassVar = ("control", "law", "scan")
 
     def __init__(self, assignment: Assignment) -> None:
         """Begin; raises PluginError if `begin` of the law fails or gives what cannot be used."""
         law, kind = assignment.law, assignment.kind
-        self._law, self.tick_s = law, 1.0 / assignment.body_hz
+        self.law, self.tick_s = law, 1.0 / assignment.body_hz
         self.alone = law.ALONE  # the law moves a robot without neighbours
         self.facts = RobotFacts(
             assignment.name, assignment.number, assignment.count, kind.flies, kind.speed,
@@ -101,14 +98,15 @@ class Stepping:
         self.velocity, self.goal, self.yaw = REST, UNKNOWN, nan
         self.gives_goal = False
         self.measures: dict[str, float] = {}  # likewise
+        self.mind: Any = None  # the same in compiled ticks, while there are any
         self.moves = True  # the robot may move; set by its caller, and likewise
         self.scan: Any = None  # range readings
         self.deviation = nan  # deviation of what the neighbours believe [m]
-        self.tick, self._stepped = 0, -1  # number of the tick since the common start
+        self.tick, self.stepped = 0, -1  # number of the tick since the common start
         self._target = UNKNOWN
 
     def _begin(self) -> dict[str, Values]:
-        law = self._law
+        law = self.law
         if not (isinstance(law.SAYS, Mapping) and all(isinstance(said, Said) for said in law.SAYS.values())):
             raise PluginError(f"SAYS of the law {type(law).__name__} must name a Said for each variable")
         for name, said in law.SAYS.items():
@@ -136,12 +134,12 @@ class Stepping:
     @property
     def says(self) -> dict[str, int]:
         """Sizes of the variables that it says, by name."""
-        return {name: len(self.memory[name]) for name in self._law.SAYS}
+        return {name: len(self.memory[name]) for name in self.law.SAYS}
 
     def said_by(self, words: Mapping[str, Values]) -> dict[str, Values]:
         """Variables that a neighbour said; NaN for those that it did not say, or that have another size."""
         found = {}
-        for name in self._law.SAYS:
+        for name in self.law.SAYS:
             said, size = words.get(name, ()), len(self.memory[name])
             found[name] = said if len(said) == size else (nan,) * size
         return found
@@ -152,20 +150,24 @@ class Stepping:
         view.time = self.tick * self.tick_s
         view.moves, view.scan = self.moves, self.scan
         view.deviation = self.deviation
-        if self._stepped >= 0:
-            passed = (self.tick - self._stepped) * self.tick_s
-            view.step_s = min(max(passed, self.tick_s), MOST_STEPS * self.facts.step_s)
+        view.step_s = self.length()
         return view
 
-    def aim(self, view: View, target: Vector) -> None:
-        """Tell the view where the plan is now, and how fast it moves."""
-        last, view.target = self._target, target
-        if is_finite(last) and is_finite(target):
-            s = view.step_s
-            view.target_velocity = (
-                (target[0] - last[0]) / s, (target[1] - last[1]) / s, (target[2] - last[2]) / s
-            )  # fmt: skip
+    def length(self) -> float:
+        """Length of the next step [s]; quiet."""
+        length = self.facts.step_s
+        if self.stepped >= 0:
+            passed = (self.tick - self.stepped) * self.tick_s
+            length = min(max(passed, self.tick_s), MOST_STEPS * length)
+        return length
+
+    def speed_of(self, target: Vector, s: float) -> Vector:
+        """Velocity of the plan, which is at `target` [m] now, `s` [s] after the last step; quiet."""
+        (x, y, z), speed = self._target, ZERO
+        if is_finite(self._target) and is_finite(target):
+            speed = (target[0] - x) / s, (target[1] - y) / s, (target[2] - z) / s
         self._target = target
+        return speed
 
     def step(self, view: View) -> None:
         """Step, and keep what the law decided."""
@@ -175,13 +177,13 @@ class Stepping:
         self.yaw = float(control.yaw)
         self.memory = {name: tuple(map(float, values)) for name, values in control.memory.items()}
         self.measures = {name: float(value) for name, value in control.measures.items()}
-        self._stepped = self.tick
+        self.stepped = self.tick
         if self.speech is not None:
             self.speech.update(self.memory)
 
     def rehearse(self, view: View) -> Control:
         """Step of the law, of which nothing is kept. Raises PluginError where a result is not what it must be."""
-        law, memory = self._law, self.memory
+        law, memory = self.law, self.memory
         control = law.step(view, dict(memory))  # one that writes into it must not count rehearsals
         if not isinstance(control, Control):
             raise wrong("law", law, "step", control, "a Control")
@@ -202,6 +204,15 @@ class Stepping:
     def sound(self) -> bool:
         """Whether all that the last step decided for the body is finite, or a height that is left out."""
         return is_sound(self.control)
+
+
+def deviation(change: float, now: Values, said: Values, metre: float) -> float:
+    """Largest deviation [m] of variables from what was said, `change` or that of the next; infinite if one is new."""
+    if not is_known(now):
+        return change
+    if not said or not is_known(said):
+        return inf
+    return max(change, dist(now, said) / metre)
 
 
 def is_sound(control: Control) -> bool:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from math import isfinite, nan
+from math import isfinite, isnan, nan
 from typing import Any, ClassVar, Final, Literal, TypeVar
 
 import msgspec
@@ -87,7 +87,7 @@ class View:
     said: Memory  # own variables, as said last: what the neighbours believe of this robot
     neighbours: Sequence[NeighbourView]  # those of its links that are there, in the order of their numbers
     time: float = 0.0  # time since the common start, by ticks [s]
-    step_s: float = field(init=False)  # time since the last step, by ticks [s]
+    step_s: float = field(default=nan, kw_only=True)  # time since the last step, by ticks [s]
     position: Vector = UNKNOWN  # own, measured [m]
     velocity: Vector = ZERO  # own, measured [m/s]
     yaw: float = 0.0  # own [rad]
@@ -99,7 +99,8 @@ class View:
     moves: bool = True  # False while safety holds it: integrals of what its motion must mend stop then
 
     def __post_init__(self) -> None:
-        self.step_s = self.robot.step_s
+        if isnan(self.step_s):
+            self.step_s = self.robot.step_s
 
     def known(self, *names: str) -> list[NeighbourView]:
         """Neighbours that have said all variables of these names."""

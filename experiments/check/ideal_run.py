@@ -17,7 +17,6 @@ import msgspec
 import numpy as np
 
 from agents.body.kinds import Kind
-from agents.plugins.laws import Gradient
 from agents.safety.hazards import HazardChange, Outcome
 from experiments.definition.experiment import WorldTable
 from experiments.definition.plan import Plan
@@ -84,18 +83,19 @@ def isolated(plan: Plan) -> Plan:
 
 def flown_ticks(bare: Plan, ticks: float) -> float:
     """Robot ticks that are flown, of `ticks`."""
-    if ticks <= WORK or refusal(bare):
-        return WORK
-    return (SPEED_UP if isinstance(bare.law, Gradient) else STEPS_UP) * WORK
+    return WORK if ticks <= WORK else uncompiled(bare)[1] * WORK
 
 
-def refusal(bare: Plan) -> str:
-    """Reason why the ticks of a plan are not compiled, as a second of it shows; empty if they are."""
+def uncompiled(bare: Plan) -> tuple[str, float]:
+    """Reason why ticks of a plan, or steps of its law, are not compiled, and its speed-up, as a second of it shows."""
     stretch.WORK[0] += stretch.PAYS_S
     flight = simulation.VirtualRun(bare.changed(duration_s=1.0), bare.experiment.seed, quiet=True, lean=True)
     with suppress(conductor.Stuck):
         flight.fly(landing=False, progress=lambda _: None, watch=None)
-    return "it is not possible" if flight.stretches is None else flight.stretches.refusal
+    if flight.stretches is None or flight.stretches.refusal:
+        return "it is not possible" if flight.stretches is None else flight.stretches.refusal, 1.0
+    steps = flight.stretches.called_back
+    return steps, STEPS_UP if steps else SPEED_UP
 
 
 def ticking_plugins(plan: Plan) -> list[type]:

@@ -3,11 +3,13 @@
    What Python would raise sets `fault`: the ticks are then flown in Python, which tells the error. Whole numbers beyond
    2^61 set it too, since Python's have no end. `turns` counts those of all loops: one that never ends is left. */
 
-typedef long long whole;
+typedef long long whole, name; /* names of robots are their numbers */
 
 double sin(double), cos(double), tan(double), asin(double), acos(double), atan(double), atan2(double, double);
 double exp(double), expm1(double), log(double), tanh(double), pow(double, double), fmod(double, double);
 double floor(double), ceil(double), trunc(double), rint(double), sqrt(double), fabs(double), copysign(double, double);
+int snprintf(char *, unsigned long, const char *, ...);
+double strtod(const char *, char **);
 #ifndef __TINYC__ /* an instruction each, where a compiler knows them */
 #define sqrt __builtin_sqrt
 #define fabs __builtin_fabs
@@ -68,6 +70,50 @@ static inline double py_min(double x, double y) { return y < x ? y : x; }
 static inline double py_max(double x, double y) { return y > x ? y : x; }
 static inline double py_abs(double x) { return fabs(x); }
 static inline whole py_round(double x) { return py_int(rint(x)); }
+static inline whole py_turns(whole first, whole end, whole step) {
+  return (step > 0) == (first < end) && first != end ? (end - first) / step + 1 : 0;
+}
+static inline double py_digits(double x, int digits) { /* float(f"{x:.7g}") */
+  char text[64];
+  snprintf(text, sizeof text, "%.*g", digits, x);
+  return strtod(text, 0);
+}
+static double py_hypot(int n, const double *x) { /* as CPython's `vector_norm`: squares in two parts each, and a step */
+  double most = 0.0, sum = 1.0, rest = 0.0, carry = 0.0, scale = 1.0, unit = 1.0;
+  _Bool odd = 0;
+  for (int k = 0; k < n; k++) {
+    if (x[k] != x[k]) odd = 1;
+    if (fabs(x[k]) > most) most = fabs(x[k]);
+  }
+  if (most == inf) return most;
+  if (odd) return unknown.number;
+  if (most == 0.0 || n <= 1) return most;
+  if (most < 0x1p-1024) unit = 0x1p-1022;
+  most /= unit;
+  while (most * scale >= 1.0) scale *= 0.5;
+  while (most * scale < 0.5) scale *= 2.0;
+  for (int k = 0; k <= n; k++) {
+    double root = k < n ? 0.0 : sqrt(sum - 1.0 + (rest + carry)), y = k < n ? x[k] / unit * scale : root;
+    double up = y * 134217729.0, high = up - (up - y), low = y - high;
+    double p = high * high, q = high * low + low * high, square = p + q, part = p - square + q + low * low, before = sum;
+    if (k == n) square = -square, part = -part;
+    sum += square;
+    rest += part;
+    carry += (before - sum) + square;
+    if (k == n) return unit * ((root + (sum - 1.0 + (rest + carry)) / (2.0 * root)) / scale);
+  }
+  return 0.0;
+}
+
+/* memory of lists that a step makes */
+static double room[1 << 15];
+static whole rooms;
+static inline void *py_room(whole bytes) {
+  whole words = (bytes + 7) / 8;
+  if (words < 0 || rooms + words > (whole)(sizeof room / 8)) { fault = 1; return room; }
+  rooms += words;
+  return room + rooms - words;
+}
 
 /* of `math`, where some numbers are an error */
 #define OF_MATH(name, error) static inline double py_##name(double x) { if (error) fault = 1; return name(x); }

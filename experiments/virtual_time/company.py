@@ -6,7 +6,8 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from math import nan
 from typing import Final
 
 from agents.decision.neighbours import Neighbour
@@ -14,6 +15,7 @@ from agents.network.channel_model import ROUNDING_S
 from agents.plugins.planners import NO_TARGET
 from agents.robot import Robot
 from agents.vectors import Pose, Vector
+from experiments.virtual_time.laws import MEASURES, Mind, Variables, numbers, speak, variables
 from twins.body import Twin
 
 WIDTH: Final = 19  # numbers of a robot in a sample
@@ -29,57 +31,74 @@ AT_END, AT_PHASES, AT_HAZARDS = 0, 1, 2
 class Way:
     """Link of constant delay, with the samples that are on it."""
 
-    __slots__ = ("delay", "first", "neighbour", "next", "samples", "size")
+    __slots__ = ("delay", "first", "neighbour", "next", "said", "samples", "size", "wide")
 
     neighbour: Neighbour  # the sender, as the receiver knows it
     delay: float  # [s]
     size: int  # samples for which there is room, and one more
     first: int  # index of the first sample
     next: int  # index behind the last one
-    samples: array[float]  # time of arrival [s], number, stamp [s], position [m], velocity [m/s] and yaw [rad] of each
+    wide: int  # numbers of a sample
+    # time of arrival [s], number, stamp [s], position [m], velocity [m/s], yaw [rad] and words of each
+    samples: array[float]
+    said: Variables  # words beside the last pose that was received
 
-    def __init__(self, neighbour: Neighbour, delay: float, size: int) -> None:
+    def __init__(self, neighbour: Neighbour, delay: float, size: int, says: Mapping[str, int]) -> None:
+        """`says`: sizes of the variables beside poses."""
         self.neighbour, self.delay, self.size = neighbour, delay, size
         self.first, self.next = 0, 0
-        self.samples = array("d", (0.0,)) * (SENT * size)
+        self.said = variables(says)
+        self.wide = SENT + sum(says.values())
+        self.samples = array("d", (0.0,)) * (self.wide * size)
 
-    def put(self, seq: int, stamp: float, position: Vector, velocity: Vector, yaw: float) -> None:
+    def put(  # noqa: PLR0917 - quiet
+        self, seq: int, stamp: float, position: Vector, velocity: Vector, yaw: float, words: array[float]
+    ) -> None:
         """A sample sets out."""
-        k, samples = self.next * SENT, self.samples
+        k, samples = self.next * self.wide, self.samples
         samples[k], samples[k + 1] = stamp + self.delay, float(seq)
         samples[k + 2] = stamp
         samples[k + 3], samples[k + 4], samples[k + 5] = position
         samples[k + 6], samples[k + 7], samples[k + 8] = velocity
         samples[k + 9] = yaw
+        for j in range(self.wide - SENT):
+            samples[k + SENT + j] = words[j]
         self.next = (self.next + 1) % self.size
 
     def deliver(self, t: float) -> None:
         """The receiver gets the samples that have arrived by `t` [s]."""
-        samples = self.samples
-        while self.first != self.next and samples[self.first * SENT] <= t + ROUNDING_S:
-            k, sender = self.first * SENT, self.neighbour
+        samples, said = self.samples, numbers(self.said)
+        while self.first != self.next and samples[self.first * self.wide] <= t + ROUNDING_S:
+            k, sender = self.first * self.wide, self.neighbour
             if samples[k + 2] > sender.stamp:
                 sender.position = samples[k + 3], samples[k + 4], samples[k + 5]
                 sender.velocity = samples[k + 6], samples[k + 7], samples[k + 8]
                 sender.stamp, sender.arrival = samples[k + 2], samples[k]
                 sender.yaw = samples[k + 9]
+                for j in range(self.wide - SENT):
+                    said[j] = samples[k + SENT + j]
             self.first = (self.first + 1) % self.size
 
 
 class Member:
     """Robot with its twin, and the links on which it sends."""
 
-    __slots__ = ("robot", "row", "seq", "twin", "ways")
+    __slots__ = ("mind", "robot", "row", "seq", "twin", "ways", "words")
 
     row: int
     seq: int  # number of its last transmission
     robot: Robot
     twin: Twin
     ways: list[Way]
+    mind: Mind | None  # law that remembers
+    words: array[float]  # words of the last transmission
 
-    def __init__(self, row: int, robot: Robot, twin: Twin) -> None:
+    def __init__(self, row: int, robot: Robot, twin: Twin, words: int) -> None:
+        """`words`: numbers beside a pose."""
         self.row, self.robot, self.twin = row, robot, twin
         self.seq, self.ways = 0, []
+        self.mind = None if robot.stepping is None else Mind(robot.stepping)
+        self.words = array("d", (nan,)) * words
 
 
 class Planned:
@@ -103,39 +122,51 @@ class Planned:
 class Ledger:
     """Notes of a run."""
 
-    __slots__ = ("count", "lean", "reason", "rows", "sample", "samples", "sent", "times")
+    __slots__ = ("count", "lean", "memory", "minds", "reason", "rows", "sample", "samples", "sent", "times", "wide")
 
     lean: bool  # True for samples of true positions alone
     reason: int  # why a stretch ended: `AT_END`, or with the tick half done `AT_PHASES` or `AT_HAZARDS`
     count: int  # transmissions so far
-    sent: array[float]  # row, number, time [s], position [m], velocity [m/s] and yaw [rad] of each
+    wide: int  # numbers of a transmission
+    sent: array[float]  # row, number, time [s], position [m], velocity [m/s], yaw [rad] and words of each
     rows: int
     sample: int  # samples so far
     times: array[float]  # times of samples [s]
     samples: array[float]  # `WIDTH` numbers for each sample and robot, or `LEAN`
+    memory: int  # most numbers of the memory of a law
+    minds: array[float]  # memory, number of its measures, and `MEASURES` of these for each sample and robot
 
-    def __init__(self, rows: int, transmissions: int, samples: int, *, lean: bool) -> None:
-        self.rows, self.lean = rows, lean
+    def __init__(self, members: Sequence[Member], transmissions: int, samples: int, *, lean: bool) -> None:
+        """Ledger of `transmissions` of each member, and `samples`."""
+        self.rows = rows = len(members)
+        self.lean, self.wide = lean, SENT + max(len(each.words) for each in members)
         self.count, self.sample = 0, 0
         self.reason = AT_END
         self.times = array("d", (0.0,)) * samples
-        self.sent = array("d", (0.0,)) * (SENT * transmissions)
+        self.sent = array("d", (0.0,)) * (self.wide * transmissions * rows)
+        sizes = [0 if lean else sum(map(len, each.mind.memory.all().values())) for each in members if each.mind]
+        self.memory = max(sizes, default=0)
+        self.minds = array("d", (0.0,)) * ((self.memory + 1 + MEASURES) * samples * rows * bool(sizes))
         self.samples = array("d", (0.0,)) * ((LEAN if lean else WIDTH) * samples * rows)
 
     def note_sent(self, member: Member, t: float) -> None:
         robot, sent = member.robot, self.sent
-        k = self.count * SENT
+        k = self.count * self.wide
         sent[k], sent[k + 1] = float(member.row), float(member.seq)
         sent[k + 2] = t
         sent[k + 3], sent[k + 4], sent[k + 5] = robot.sent_position
         sent[k + 6], sent[k + 7], sent[k + 8] = robot.sent_velocity
         sent[k + 9] = robot.now.state.yaw
+        for j in range(self.wide - SENT):
+            sent[k + SENT + j] = member.words[j]
         self.count += 1
 
     def note_state(self, member: Member) -> None:
         """Note the state of a robot in the present sample."""
         robot, samples = member.robot, self.samples
         state = robot.now.state
+        if member.mind is not None:
+            self.note_mind(member.mind, self.sample * self.rows + member.row)
         if self.lean:
             k = LEAN * (self.sample * self.rows + member.row)
             samples[k], samples[k + 1], samples[k + 2] = state.true_position
@@ -148,6 +179,18 @@ class Ledger:
         samples[k + 11], samples[k + 12], samples[k + 13] = robot.goal
         samples[k + 14], samples[k + 15], samples[k + 16], samples[k + 17] = robot.setpoint
         samples[k + 18] = robot.error
+
+    def note_mind(self, mind: Mind, row: int) -> None:
+        """Note what a law remembers and measures, as one row of `minds`."""
+        k, minds = (self.memory + 1 + MEASURES) * row, self.minds
+        memory = numbers(mind.memory)
+        if not self.lean:
+            for j in range(len(memory)):
+                minds[k + j] = memory[j]
+        k += self.memory
+        minds[k] = float(mind.measured)
+        for j in range(MEASURES):
+            minds[k + 1 + j] = mind.measures[j]
 
 
 class Crew:
@@ -191,9 +234,12 @@ def transmit(members: list[Member], t: float, ledger: Ledger) -> None:
         robot = member.robot
         if robot.question(t):
             member.seq += 1
+            speech = robot.transmitter.speech
+            if member.mind is not None and speech is not None:
+                speak(member.mind, speech, member.words)
             ledger.note_sent(member, t)
             for way in member.ways:
-                way.put(member.seq, t, robot.sent_position, robot.sent_velocity, robot.now.state.yaw)
+                way.put(member.seq, t, robot.sent_position, robot.sent_velocity, robot.now.state.yaw, member.words)
 
 
 def detect(members: list[Member], t: float) -> bool:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from array import array
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain
 from math import inf, nan
@@ -24,6 +25,7 @@ from experiments.definition.link_conditions import FROM_CENTRE, TO_CENTRE, condi
 from experiments.definition.plan import Plan
 from experiments.recording.trace import EPOCH
 from experiments.virtual_time.company import SENT, Ledger, Member, Way
+from experiments.virtual_time.steps import words_of
 from twins.arrays import Array, Index
 
 
@@ -226,7 +228,8 @@ class VirtualNetwork:
         for way in ways:
             way.first = way.next = 0
         for link, _, sample in under_way:
-            ways[link].put(sample.seq, sample.stamp, sample.position, sample.velocity, sample.yaw)
+            words = array("d", self._numbers(sample.words))
+            ways[link].put(sample.seq, sample.stamp, sample.position, sample.velocity, sample.yaw, words)
         return under_way
 
     def take_back(self, handed: Sequence[Arrived]) -> None:
@@ -235,19 +238,9 @@ class VirtualNetwork:
             self._channel.send(link, sample, sample.seq, sample.stamp)
 
     def leave(
-        self,
-        ways: Sequence[Way],
-        members: Sequence[Member],
-        ledger: Ledger,
-        before: Sequence[Arrived],
-        t: float,
-        *,
-        words: Callable[[int, float], Words],
+        self, ways: Sequence[Way], members: Sequence[Member], ledger: Ledger, before: Sequence[Arrived], t: float
     ) -> None:
-        """Take over what members sent until `t` [s], by their ledger, and what was received of it and of `before`.
-
-        `words`: what a robot, by its row, said at a time [s].
-        """
+        """Take over what members sent until `t` [s], by their ledger, and what was received of it and of `before`."""
         for member in members:
             self.seq[member.row] = member.seq
         under_way = []
@@ -255,18 +248,16 @@ class VirtualNetwork:
             robot, number = self.receivers[link]
             while way.first != way.next:
                 k, row = way.first, robot.neighbours.all[number].sender
-                _, seq, stamp, x, y, z, vx, vy, vz, yaw = way.samples[k * SENT : (k + 1) * SENT]
-                pose = Sample(row, int(seq), stamp, (x, y, z), (vx, vy, vz), yaw, words=words(row, stamp))
+                _, seq, stamp, x, y, z, vx, vy, vz, yaw, *said = way.samples[k * way.wide : (k + 1) * way.wide]
+                pose = Sample(row, int(seq), stamp, (x, y, z), (vx, vy, vz), yaw, words=words_of(self.says, said))
                 under_way.append((stamp, row, link, pose))
                 way.first = (k + 1) % way.size
         for stamp, _, link, sample in sorted(under_way, key=itemgetter(0, 1, 2)):  # same order as they were sent
             self._channel.send(link, sample, sample.seq, stamp)
-        sent = np.frombuffer(ledger.sent)[: ledger.count * SENT].reshape(-1, SENT)
+        sent = np.frombuffer(ledger.sent)[: ledger.count * ledger.wide].reshape(-1, ledger.wide)
         sent = sent[np.lexsort((sent[:, 0], sent[:, 2]))]  # robots of a kind are flown together
-        said = list[tuple[float, ...]]()
-        if self.says and not self._lean:
-            said = [self._numbers(words(int(row), stamp)) for row, _, stamp in sent[:, :3].tolist()]
-        self._sent.extend(sent, sent[:, 2], sent[:, 0], said)
+        sent, words = sent[:, :SENT], sent[:, SENT:]
+        self._sent.extend(sent, sent[:, 2], sent[:, 0], words.tolist() if self.says and not self._lean else ())
         if not self._lean:
             self._receive_all(sent, before, t)
 

@@ -16,9 +16,12 @@ from typing import Any, Final, NamedTuple, cast
 
 import numpy as np
 
+from agents.plugins.law import Law
+
 WORD: Final = 8  # bytes
 FLOAT, INT, BOOL = "float", "int", "bool"
 NUMBERS: Final[dict[type, str]] = {float: FLOAT, int: INT, bool: BOOL}
+LONG: Final = 1000  # length from which a text or a table of a law is none that its step reads
 LEFT_OUT: Final = {"assignment", "_assignment", "_generator", "_preflight"}  # names of no use to a quiet function
 
 
@@ -154,6 +157,8 @@ class Layouts:
                 kind = self.kind(value, (owner, name))
             if kind is not None:
                 fields[name] = kind
+            elif isinstance(thing, Law) and isinstance(value, str | dict) and len(value) < LONG:
+                fixed[name] = value
             elif value is None or name in names or (isinstance(value, list | tuple) and not value):
                 fixed[name] = value[:0] if isinstance(value, list) else value  # it may be filled later
         key = (owner, tuple(fields.items()), repr(fixed) if fixed else "")

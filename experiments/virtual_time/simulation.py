@@ -307,10 +307,10 @@ class VirtualRun:
         count, rows = ledger.sample, len(self.robots)
         columns = self._columns
         columns.setdefault("time", []).append(np.array(ledger.times[:count]))
-        for memory, measures in steps.remembered(ledger.times[:count]):
-            self._measures.add(measures)
-            if not self.lean:
-                self._memory.add(memory)
+        if any(self._laws):
+            memory, measures = steps.columns(ledger)
+            self._memory.extend(count, memory)
+            self._measures.extend(count, measures)
         wide = LEAN if self.lean else WIDTH
         numbers = np.frombuffer(ledger.samples)[: count * rows * wide].reshape(count, rows, wide)
         if self.lean:
@@ -384,6 +384,11 @@ class LawColumns:
     def add(self, sample: Sequence[Mapping[str, Any]]) -> None:
         """Add a sample, by robot."""
         self._last.append(sample)
+
+    def extend(self, count: int, columns: dict[str, Array]) -> None:
+        """Add columns over `count` samples."""
+        self._settle()
+        self._parts.append((count, columns))
 
     def columns(self) -> dict[str, Array]:
         """(K, N) of numbers, (K, N, k) of tuples; NaN where a robot has no such value."""

@@ -1,4 +1,4 @@
-"""Rare parts of compiled ticks, called back in Python: steps of laws that remember, and changes of the formation.
+"""Rare parts of compiled ticks, called back in Python: steps of laws outside of the subset.
 
 There all that a law may use is at hand. What it reads and writes is copied from the records, and to them.
 """
@@ -6,81 +6,76 @@ There all that a law may use is at hand. What it reads and writes is copied from
 from __future__ import annotations
 
 import ctypes
-from bisect import bisect_right
-from collections.abc import Iterator, Mapping, Sequence
-from math import inf
-from operator import attrgetter
-from typing import Any, Final, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
 
 from agents.decision.goals import GoalComputer
-from agents.decision.neighbours import NO_WORDS, Neighbour
-from agents.decision.stepping import Stepping, Words
-from agents.plugins.law import Memory
-from agents.robot import Robot
+from agents.decision.neighbours import NO_WORDS
+from agents.decision.stepping import Words
+from agents.plugins.law import is_known
+from experiments.virtual_time.company import Ledger, Member
+from experiments.virtual_time.laws import MEASURES
 from experiments.virtual_time.records import Image
+from twins.arrays import Array
 
 CALL: Final = ctypes.PYFUNCTYPE(ctypes.c_int64, ctypes.c_int64, ctypes.c_int64, ctypes.POINTER(ctypes.c_double))
 
 
-class Step(NamedTuple):
-    """Result of a step: memory and measures of a robot, and the variables that it says from then on."""
-
-    time: float  # [s]
-    memory: Memory
-    measures: Mapping[str, float]
-    words: Words
-
-
 class Steps:
-    """Steps of the laws of all robots in a stretch."""
+    """Laws of all robots in stretches."""
 
-    def __init__(self, robots: Sequence[Robot]) -> None:
-        self._robots = robots
-        self._rows = [row for row, robot in enumerate(robots) if robot.stepping is not None]
-        self._speak = any(robot.stepping is not None and robot.stepping.speech is not None for robot in robots)
-        self._done: list[list[Step]] = [[] for _ in robots]
-        self._under_way: Mapping[tuple[int, float], Words] = {}  # words by sender and stamp of what was sent before
+    def __init__(self, members: Sequence[Member]) -> None:
+        self._members = members
+        self._minds = [(each.mind, law) for each in members if each.mind and (law := each.robot.stepping)]
+        for mind, law in self._minds:
+            law.mind = mind
+        self._names = list[str]()  # names of measures
         self.error: BaseException | None = None  # error of a law, or interruption
         self.call = CALL(self._call)
         self.address = ctypes.cast(self.call, ctypes.c_void_p).value or 0
 
-    def begin(self, under_way: Mapping[tuple[int, float], Words]) -> None:
-        """Begin a stretch; `under_way` are the words of the samples that are on their way."""
-        self._under_way, self.error = under_way, None
-        senders = [each for robot in self._robots for each in robot.neighbours.all]
-        self._stamps = {id(each): each.stamp for each in senders}
-        self._said = {id(each): each.said for each in senders}
-        for row, robot in enumerate(self._robots):
-            law = robot.stepping
-            self._done[row] = [Step(-inf, {}, {}, ()) if law is None else _step_of(law, -inf)]
+    def begin(self, measures: list[str]) -> None:
+        """Begin a stretch; `measures` are names of measures, to which others may be added."""
+        self._names, self.error = measures, None
+        for mind, law in self._minds:
+            mind.called_back = False
+            mind.take(law, measures)
+            for way in mind.ways:
+                way.said.hear(way.neighbour.said)
 
     def board(self, image: Image) -> None:
-        """Find the records of a stretch; what steps change can be taken back."""
-        laws = [law for robot in self._robots if (law := robot.stepping) is not None]
-        self._kept = [(each, each.__dict__.copy()) for law in laws for each in (law, law.speech) if each is not None]
-        self._rare = {
-            image.address(robot.goals): row
-            for row, robot in enumerate(self._robots)
-            if robot.stepping is not None or robot.goals.changes_shape
-        }
-        if not self._rare:
+        """Find the records of a stretch; what is called back can be undone."""
+        rare = [each for each in self._members if each.mind or each.robot.goals.changes_shape]
+        self._rare = {image.address(each.robot.goals): each for each in rare}
+        if not rare:
             return
         self._image, self._begun = image, image.words.copy()
-        places = {id(thing): (thing, layout, at) for thing, layout, at in image.changing}
-        self._records = [[places[id(each)] for each in robot.goals.rare_parts()] for robot in self._robots]
+        self._places = {id(thing): (thing, layout, at) for thing, layout, at in image.changing}
+        things = [thing for _, law in self._minds for thing in (law, law.speech) if thing is not None]
+        self._kept = [(thing, thing.__dict__.copy()) for thing in things]
+        self._said = [(way.neighbour, way.neighbour.said) for mind, _ in self._minds for way in mind.ways]
 
     def _call(self, address: int, which: int, given: Any) -> int:  # noqa: ANN401 - an array of C
         """A rare function of the goals of a robot; returns 1 after an error."""
         try:
-            row = self._rare[address]
-            robot, records = self._robots[row], self._records[row]
+            member = self._rare[address]
+            goals, mind = member.robot.goals, member.mind
+            parts = [*goals.rare_parts(), *(mind.parts() if mind else ())]
+            records = [self._places[id(each)] for each in parts if id(each) in self._places]
             for thing, layout, at in records:
                 layout.load(thing, self._image.memory, at)
-            if GoalComputer.RARE[which] == "step":
-                self._step(row, robot, given[:9])
-            else:
+            if GoalComputer.RARE[which] == "reshape":
                 elapsed, x, y, z, t = given[:5]
-                robot.goals.reshape(elapsed, (x, y, z), t)
+                goals.reshape(elapsed, (x, y, z), t)
+            elif mind is not None and goals.stepping is not None:
+                for way in mind.ways:
+                    way.neighbour.said = way.said.known() or NO_WORDS
+                t, x, y, z, vx, vy, vz, yaw, start = given[:9]
+                goals.step(t, (x, y, z), (vx, vy, vz), yaw, start)
+                mind.take(goals.stepping, self._names)
+                mind.called_back = True
             for thing, layout, at in records:
                 layout.store(self._image, thing, at)
         except BaseException as error:  # noqa: BLE001 - C cannot pass it on: the stretch is flown again in Python
@@ -88,56 +83,52 @@ class Steps:
             return 1
         return 0
 
-    def _step(self, row: int, robot: Robot, given: Sequence[float]) -> None:
-        law = robot.stepping
-        assert law is not None
-        for sender in robot.neighbours.all:
-            self._hear(sender)
-        t, x, y, z, vx, vy, vz, yaw, start = given
-        robot.goals.step(t, (x, y, z), (vx, vy, vz), yaw, start)
-        self._done[row].append(_step_of(law, t))
-
-    def _hear(self, sender: Neighbour) -> None:
-        """Words of the last pose of a sender."""
-        if self._speak and sender.stamp != self._stamps[id(sender)]:
-            self._stamps[id(sender)] = sender.stamp
-            words = self.words(sender.sender, sender.stamp)
-            sender.said = dict(words) if words else NO_WORDS
-
-    def words(self, row: int, stamp: float) -> Words:
-        """Words of the sample that a robot sent at a time [s]."""
-        if (known := self._under_way.get((row, stamp))) is not None:
-            return known
-        return self._at(row, stamp).words
-
-    def _at(self, row: int, t: float) -> Step:
-        done = self._done[row]
-        return done[bisect_right(done, t, key=attrgetter("time")) - 1]
-
-    def end(self) -> None:
-        """The robots have all words of a stretch."""
-        for robot in self._robots:
-            for sender in robot.neighbours.all:
-                self._hear(sender)
+    def leave(self) -> None:
+        """The robots have all that their laws remember, and all words."""
+        for mind, law in self._minds:
+            mind.give(law, self._names)
+            for way in mind.ways:
+                way.neighbour.said = way.said.known() or NO_WORDS
 
     def undo(self) -> None:
-        """Take all steps of a stretch back, and what was read from the records for them."""
+        """Take all that was called back in a stretch back, and what was read from the records for it."""
+        if not self._rare:
+            return
         for thing, before in self._kept:
             thing.__dict__.clear()
             thing.__dict__.update(before)
-        if self._rare:
-            self._image.words[:] = self._begun
-            self._image.load()
-            for robot in self._robots:
-                for sender in robot.neighbours.all:
-                    sender.said = self._said[id(sender)]
+        self._image.words[:] = self._begun
+        self._image.load()
+        for neighbour, said in self._said:
+            neighbour.said = said
 
-    def remembered(self, times: Sequence[float]) -> Iterator[tuple[list[Memory], list[Mapping[str, float]]]]:
-        """Memory and measures of all robots at each of these times [s]."""
-        for t in times if self._rows else ():
-            steps = [self._at(row, t) for row in range(len(self._robots))]
-            yield [each.memory for each in steps], [each.measures for each in steps]
+    def columns(self, ledger: Ledger) -> tuple[dict[str, Array], dict[str, Array]]:
+        """Memory (K, N, k) and measures (K, N) of all robots at the samples of a stretch, by name."""
+        if not self._minds:
+            return {}, {}
+        wide, rows = ledger.memory + 1 + MEASURES, len(self._members)
+        table = np.frombuffer(ledger.minds)[: ledger.sample * rows * wide].reshape(-1, rows, wide)
+        measured = table[:, :, ledger.memory].astype(np.intp)
+        measures, memory = dict[str, Array](), dict[str, Array]()
+        for k, name in enumerate(self._names):
+            there = (measured >> k & 1).astype(bool)
+            if there.any():
+                measures[name] = np.where(there, table[:, :, ledger.memory + 1 + k], np.nan)
+        for mind, _ in self._minds if ledger.memory else ():
+            row, begin = next(each.row for each in self._members if each.mind is mind), 0
+            for name, values in mind.memory.all().items():
+                blank = np.full((ledger.sample, rows, len(values)), np.nan)
+                memory.setdefault(name, blank)[:, row] = table[:, row, begin : begin + len(values)]
+                begin += len(values)
+        return memory, measures
 
 
-def _step_of(law: Stepping, t: float) -> Step:
-    return Step(t, law.memory, law.measures, () if law.speech is None else law.speech.fresh)
+def words_of(says: Mapping[str, int], values: Sequence[float]) -> Words:
+    """Variables of these sizes from all their numbers, those that are known."""
+    found, begin = list[tuple[str, tuple[float, ...]]](), 0
+    for name, size in says.items():
+        part = tuple(values[begin : begin + size])
+        if is_known(part):
+            found.append((name, part))
+        begin += size
+    return tuple(found)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
@@ -12,16 +12,18 @@ from typing import Any, Final, Protocol
 import msgspec
 import numpy as np
 
+from agents.decision.goals import GoalComputer
 from agents.decision.lifecycle import READY
 from agents.plugins.planners import NO_TARGET, Itinerary
 from agents.robot import Robot
 from experiments.definition.plan import Plan
-from experiments.virtual_time import company, machine
+from experiments.virtual_time import company, laws, machine
 from experiments.virtual_time.company import AT_END, Crew, Ledger, Member, Planned, Way
+from experiments.virtual_time.kinds import BOOLEAN, DOUBLE, WHOLE, OutsideError
 from experiments.virtual_time.network import VirtualNetwork
 from experiments.virtual_time.records import Image, Layouts, RecordLayout
 from experiments.virtual_time.steps import Steps
-from experiments.virtual_time.translation import BOOLEAN, DOUBLE, WHOLE, OutsideError, Program
+from experiments.virtual_time.translation import Program
 from twins.body import TwinBody
 
 TICK_S: Final = 15e-6  # [s] CPU time of a tick of a robot in plain Python: 10 to 20 µs
@@ -107,7 +109,8 @@ def expect(seconds: float) -> None:
 
 def possible(flight: Flown) -> bool:
     """Whether the robots of a flight can be flown by compiled functions, unless a plug-in is outside of the subset."""
-    if not flight.lonely or not machine.works():
+    says = [robot.stepping.says for robot in flight.robots if robot.stepping is not None]
+    if not flight.lonely or not machine.works() or any(each != flight.network.says for each in says):
         return False
     return all(robot.guidance is None for robot in flight.robots)
 
@@ -137,20 +140,26 @@ class Stretches:
 
     flown: int  # ticks so far
     refusal: str  # why nothing can be compiled, empty as long as it can
+    called_back: str = ""  # likewise for steps of laws, and changes of the formation
 
     def __init__(self, flight: Flown) -> None:
         self._flight, self._case = flight, msgspec.json.encode(flight.plan.experiment)
         twins = flight.twin.twins
-        self._members = [Member(row, *each) for row, each in enumerate(zip(flight.robots, twins, strict=True))]
         network, rates = flight.network, flight.plan.experiment.rates
-        self._ways: list[Way] = []
+        says = network.says
+        self._members = [
+            Member(row, robot, twin, sum(says.values()))
+            for row, (robot, twin) in enumerate(zip(flight.robots, twins, strict=True))
+        ]
+        self._steps, self._ways = Steps(self._members), list[Way]()
         for (robot, k), delay in zip(network.receivers, network.delays, strict=True):
             sender = robot.neighbours.all[k]
-            way = Way(sender, delay, ROOM + round(delay * rates.pose_hz))
+            way = Way(sender, delay, ROOM + round(delay * rates.pose_hz), says)
             self._members[sender.sender].ways.append(way)
+            if robot.stepping is not None:
+                robot.stepping.mind.ways.append(way)
             self._ways.append(way)
         self._plans: dict[int, Planned] = {}
-        self._steps = Steps(flight.robots)
         self.flown, self.refusal = 0, ""
         self._prepared: Prepared | None = None
         self._paused_until, self._pause = 0, PAUSE
@@ -168,28 +177,27 @@ class Stretches:
             return k, AT_END
         if not all(_goes_on(robot, k * flight.dt) for robot in flight.robots):
             return k, AT_END
-        ticks, rows = end - k, len(self._members)
+        ticks = end - k
         rates = flight.plan.experiment.rates
         questions = ticks // round(rates.body_hz / rates.pose_hz) + ROOM
-        ledger = Ledger(rows, questions * rows, ticks // flight.log_every + ROOM, lean=flight.lean)
+        ledger = Ledger(self._members, questions, ticks // flight.log_every + ROOM, lean=flight.lean)
         for member in self._members:
             member.seq = flight.network.seq[member.row]
             member.twin.reserve(ticks)
         before = flight.network.board(self._ways)
-        self._steps.begin({(sample.row, sample.stamp): sample.words for _, _, sample in before})
         with self._planned(k, end):
             last = self._run(ledger, k, end)
         if last < 0:
             flight.network.take_back(before)
             return k, AT_END
-        self._steps.end()
+        self._steps.leave()
         if last - k < LEAST:
             self._paused_until, self._pause = last + self._pause, min(2 * self._pause, LONGEST_PAUSE)
         else:
             self._pause = PAUSE
         self.flown += last - k
         done = last - 1 if ledger.reason == AT_END else last
-        flight.network.leave(self._ways, self._members, ledger, before, done * flight.dt, words=self._steps.words)
+        flight.network.leave(self._ways, self._members, ledger, before, done * flight.dt)
         flight.note(ledger, self._steps)
         flight.twin.moved_to(done * flight.dt)
         return last, ledger.reason
@@ -204,6 +212,7 @@ class Stretches:
             prepared = self._new(ledger)
             image = self._image(prepared, ledger)
         self._prepared, self.refusal = prepared, prepared.driver.refusal or self.refusal
+        self.called_back = next(iter(prepared.driver.program.called_back.values()), "")
         if self.refusal:
             REFUSED[str(prepared.layout)] = self.refusal
         elif image is not None:
@@ -222,6 +231,7 @@ class Stretches:
 
     def _image(self, prepared: Prepared, ledger: Ledger) -> Image | None:
         """All objects in memory, None if they are not of these layouts."""
+        self._steps.begin(prepared.driver.program.measures)
         crew = Crew([[self._members[row] for row in rows] for rows in prepared.rows], ledger)
         try:
             image = Image([(crew, prepared.layout)], prepared.words)
@@ -233,6 +243,7 @@ class Stretches:
 
     def _new(self, ledger: Ledger) -> Prepared:
         """Layouts and compiled loop of these robots; raises OutsideError, or NoCompilerError, if there is none."""
+        self._steps.begin([])
         layouts, groups = Layouts(), dict[RecordLayout | None, list[int]]()
         for member in self._members:
             layouts.of(member)
@@ -245,8 +256,9 @@ class Stretches:
         assert layout is not None
         while len(RECENT) >= MAX_RECENT:
             del RECENT[next(iter(RECENT))]
-        often = max(WORK[1], plain_s(self._flight.plan)) > OFTEN_S
-        RECENT[self._case] = found = Prepared(rows, layout, driver(layout, len(rows), often=often))
+        plan = self._flight.plan
+        often = max(WORK[1], plain_s(plan)) > OFTEN_S
+        RECENT[self._case] = found = Prepared(rows, layout, driver(layout, len(rows), plan.names, often=often))
         return found
 
     def _next_leg(self) -> int:
@@ -288,11 +300,12 @@ def _goes_on(robot: Robot, t: float) -> bool:
     return (robot.lifecycle.phase > READY or robot.lifecycle.climbing) and robot.is_steady(t)
 
 
-def driver(crew: RecordLayout, groups: int, *, often: bool) -> CompiledLoop:
-    """Compiled loop over ticks for a crew of this number of groups."""
+def driver(crew: RecordLayout, groups: int, names: Sequence[str], *, often: bool) -> CompiledLoop:
+    """Compiled loop over ticks for a crew of this number of groups, of robots with these names."""
     known = DRIVERS.get(crew)
-    if known is None or known.program.changed() or often > known.often:
-        DRIVERS[crew] = known = CompiledLoop(Program(), often)
+    numbers = {name: number for number, name in enumerate(names)}
+    if known is None or known.program.changed() or often > known.often or known.program.names != numbers:
+        DRIVERS[crew] = known = CompiledLoop(Program({GoalComputer.step: laws.step}, numbers), often)
 
         def each(text: str) -> str:
             return "; ".join(text.format(f"crew.g{k}") for k in range(groups))

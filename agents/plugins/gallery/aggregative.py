@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from math import hypot, nan
+from math import hypot, isfinite, nan
 from typing import Annotated, Any, ClassVar
 
 import msgspec
@@ -52,18 +52,25 @@ class Aggregative(Averaging, frozen=True):
 
     def step(self, view: View, memory: Memory) -> Control:
         """Steps of both estimators, and the descent."""
-        here, heard = view.position[:2], self.heard(view)
-        s, s_q, apart = self.estimate(view, memory, ("s", "s_q"), here, heard)
-        place = self.places.get(view.robot.name)
-        slope = (0.0, 0.0) if place is None else (self.team * (s[0] - place[0]), self.team * (s[1] - place[1]))
-        y, y_q, _ = self.estimate(view, memory, ("y", "y_q"), slope, heard)
-        target = view.robot.of(self.targets, (0.0, 0.0))
-        x, y_axis = (-self.descent * (self.own * (here[k] - target[k]) + y[k]) for k in (0, 1))
-        return Control(
-            memory={"s": s, "s_q": s_q, "y": y, "y_q": y_q, "n": (float(len(heard)),)},
-            velocity=(x, y_axis, nan),
-            measures={"disagreement": hypot(*apart)},
+        (x, y, _), heard = view.position, self.heard(view)
+        s_x, s_qx, apart_x = self.estimate(view, memory, ("s", "s_q"), 0, x, heard)
+        s_y, s_qy, apart_y = self.estimate(view, memory, ("s", "s_q"), 1, y, heard)
+        place = self.places.get(view.robot.name, (nan, nan))
+        slope_x, slope_y = (
+            (self.team * (s_x - place[0]), self.team * (s_y - place[1])) if isfinite(place[0]) else (0.0, 0.0)
         )
+        y_x, y_qx, _ = self.estimate(view, memory, ("y", "y_q"), 0, slope_x, heard)
+        y_y, y_qy, _ = self.estimate(view, memory, ("y", "y_q"), 1, slope_y, heard)
+        target = view.robot.of(self.targets, (0.0, 0.0))
+        v_x = -self.descent * (self.own * (x - target[0]) + y_x)
+        v_y = -self.descent * (self.own * (y - target[1]) + y_y)
+        return Control(
+            memory={
+                "s": (s_x, s_y), "s_q": (s_qx, s_qy), "y": (y_x, y_y), "y_q": (y_qx, y_qy), "n": (float(len(heard)),),
+            },
+            velocity=(v_x, v_y, nan),
+            measures={"disagreement": hypot(apart_x, apart_y)},
+        )  # fmt: skip
 
     def analyse(self, plan: Any) -> Iterator[tuple[Severity, str, str]]:  # noqa: ANN401 - plug-ins know no experiment
         """Of the estimators, and whether they are quick enough for the descent.

@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Final
 import msgspec
 from msgspec import Meta
 
-from zenpark import Control, Law, Memory, NeighbourView, Positive, RobotFacts, Said, Severity, Values, View
+from zenpark import Control, Law, Memory, NeighbourView, Positive, RobotFacts, Said, Severity, View
 
 MOST_STEP: Final = 2.0  # limit of Euler's method on a decay: rate times step
 STANDING: Final = 1e-9  # eigenvalues below are 0: of what the robots have in common
@@ -33,23 +33,21 @@ class Averaging(Law, frozen=True):
         (n,) = view.said["n"]
         return [(1.0 / max(n, each.said["n"][0], 1.0), each) for each in view.known(*self.SAYS)]
 
-    def estimate(
-        self, view: View, memory: Memory, names: tuple[str, str], signal: Sequence[float],
+    def estimate(  # noqa: PLR0917 - quiet
+        self, view: View, memory: Memory, names: tuple[str, str], k: int, u: float,
         heard: Sequence[tuple[float, NeighbourView]],
-    ) -> tuple[Values, Values, Values]:  # fmt: skip
-        """Average of a signal: next values of the variables `names`, and Σ w (x_i − x_j); a step of Euler's method."""
-        (name_x, name_q), dt = names, view.step_s
-        x_new, q_new, differences = [], [], []
-        for k, (u, x, q) in enumerate(zip(signal, memory[name_x], memory[name_q], strict=True)):
-            said_x, said_q = view.said[name_x][k], view.said[name_q][k]
-            apart, apart_q = 0.0, 0.0
-            for weight, each in heard:
-                apart += weight * (said_x - each.said[name_x][k])
-                apart_q += weight * (said_q - each.said[name_q][k])
-            x_new.append(x + dt * (self.rate * (u - x) - self.gain * apart - self.integral * apart_q))
-            q_new.append(q + dt * self.integral * apart)
-            differences.append(apart)
-        return tuple(x_new), tuple(q_new), tuple(differences)
+    ) -> tuple[float, float, float]:  # fmt: skip
+        """Average of signals u: next values of number `k` of the variables `names`, and Σ w (x_i − x_j); by Euler."""
+        name_x, name_q = names
+        x, q = memory[name_x][k], memory[name_q][k]
+        said_x, said_q = view.said[name_x][k], view.said[name_q][k]
+        apart, apart_q = 0.0, 0.0
+        dt = view.step_s
+        for weight, each in heard:
+            apart += weight * (said_x - each.said[name_x][k])
+            apart_q += weight * (said_q - each.said[name_q][k])
+        x += dt * (self.rate * (u - x) - self.gain * apart - self.integral * apart_q)
+        return x, q + dt * self.integral * apart, apart
 
     def analyse(self, plan: Any) -> Iterator[tuple[Severity, str, str]]:  # noqa: ANN401 - plug-ins know no experiment
         """Whether the steps of the estimator bear its gains on these links, and how soon it settles."""
@@ -131,5 +129,5 @@ class Average(Averaging, frozen=True):
         """Step of the estimator."""
         signal = view.robot.of(self.signal, 0.0) + view.time * view.robot.of(self.ramp, 0.0)
         heard = self.heard(view)
-        x, q, apart = self.estimate(view, memory, ("x", "q"), (signal,), heard)
-        return Control(memory={"x": x, "q": q, "n": (float(len(heard)),)}, measures={"disagreement": abs(apart[0])})
+        x, q, apart = self.estimate(view, memory, ("x", "q"), 0, signal, heard)
+        return Control(memory={"x": (x,), "q": (q,), "n": (float(len(heard)),)}, measures={"disagreement": abs(apart)})

@@ -256,6 +256,54 @@ def of_python(x, y, i, j):
     return least, abs(x), abs(i), len((x, y)), float(i), float(x < y), bool(i), min(nan, x), max(x, nan)
 
 
+def slices(x, y):
+    """of tuples, with constant ends"""
+    return (x, y, 0.5)[:2], (x, y, 0.5)[-2:], (x, y, 0.5)[::2]
+
+
+def dictionaries(x, y, i):
+    """with texts as keys, which no statement sets later; a text as an argument"""
+    table = {"b": i, "a": (x, y)}
+    return part(table, "a"), table["b"], part({"a": (y, 0.5)}, name="a")
+
+
+def part(table, name):
+    return table[name][1] if name == "a" else table[name][0]
+
+
+def comprehensions(case, x):
+    """lists that are not kept, of ranges, lists, `zip` or `enumerate`, with `if`"""
+    made, total, each = [each * x for each in case.numbers if each > 0.0], 0.0, 0.25
+    pairs = [(a + 1.0, b) for a, b in zip(case.numbers, case.numbers, strict=True)]
+    for more in made:
+        total += more
+    for a, b in pairs:
+        total += a * b
+    for k, size in enumerate(case.numbers):
+        total += k * size
+    return total, each, len(made), len([k + 1 for k in range(5, 0, -2)])
+
+
+def generators(case, x):
+    """within `any`, `all`, `sum` (of floats, Python 3.11), `min` and `max`; of a list, too"""
+    least = min((each for each in case.numbers if each > x), default=9.0), max([x, *case.numbers])
+    some = any(each > x for each in case.numbers), all(each > x for each in case.numbers)
+    return least, some, sum(each * x for each in case.numbers), sum([x, 0.5]), max(each.size for each in case.parts)
+
+
+def lengths(x, y):
+    """`hypot` and `dist` of `math` (Python 3.11)"""
+    return math.hypot(x, y), math.dist((x, y, 0.5), (y, 0.25, x)), math.hypot(x, 3.0, y)
+
+
+def digits(x):
+    """`float(f"{x:.7g}")`, of any number of digits"""
+    return float(f"{x:.7g}"), float(f"{x:.{FIVE}g}")
+
+
+FIVE = 5
+
+
 def longer(a, b=2.0, *, of=1.0):
     return (a, b) if a > b else (b, a * of)
 

@@ -19,8 +19,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from experiments.virtual_time import machine, translation
+from experiments.virtual_time.kinds import LARGEST, WHOLE, OutsideError
 from experiments.virtual_time.records import Image, Layouts
-from experiments.virtual_time.translation import LARGEST, WHOLE, OutsideError, Program
+from experiments.virtual_time.translation import Program
 from tests.cases import examples
 from tests.commands import ROOT
 from tests.experiments.virtual_time.constructs import CONSTRUCTS, ROWS, Case
@@ -255,7 +256,7 @@ OUTSIDE = {
     "case.part.size = 1": "a whole number where a float stands otherwise",
     "case.part.unused = x": "an attribute unused that is none or is not there",
     "return case.part": "",
-    "return (x, y)[:1]": "a slice",
+    "return case.numbers[:1]": "parts of something that is no tuple",
     "return (x, y)[2]": "an index outside of a tuple",
     "return (x, y) == (y, x)": "a comparison of a tuple of 2",
     "return x is y": "a comparison of a float",
@@ -267,14 +268,16 @@ OUTSIDE = {
     "return 2 ** i": "a power of a whole number with an exponent that is no small constant",
     "return round(x, 2)": "round to digits",
     "return isinstance(x, float)": "a call of isinstance",
-    "return math.hypot(x, y)": "math.hypot",
-    "return sum([x, y])": "a call of sum",
-    "return {'x': x}": "a dictionary",
+    "return math.gamma(x)": "math.gamma",
+    "return sum([i, i])": "sum of a whole number",
+    "return {x: x}": "a dictionary without texts as keys",
+    "return {'x': x}['y']": "y, which a dictionary lacks",
+    "case.numbers = [k for k in (x, y)]": "a list where a list stands otherwise",
+    "name = 'a'": "a text as a variable",
+    "return {k for k in (x, y)}": "a comprehension",
     "return [x]": "a list",
     "return f'{x}'": "an f-string",
-    "return 'x'": "'x': a text",
     "return (lambda: x)()": "a call of lambda",
-    "return [k for k in (x, y)]": "a comprehension",
     "try:\n  pass\n finally:\n  pass": "try",
     "while (k := i):\n  pass": "`(k := i)`",
     "case.parts.append(x)": "a call of case.parts.append",

@@ -1,0 +1,646 @@
+"""Expressions in C: each visit gives a `Value`, and emits the statements that come before it."""
+
+# ruff: noqa: ANN401 - constants and types
+from __future__ import annotations
+
+import ast
+import builtins
+import inspect
+import math
+import re
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from types import FunctionType, ModuleType
+from typing import TYPE_CHECKING, Any, Final
+
+from agents.decision.stepping import REST
+from agents.plugins.law import Control, NeighbourView, RobotFacts, View
+from agents.vectors import UNKNOWN
+from experiments.virtual_time.kinds import (
+    BOOLEAN,
+    DOUBLE,
+    LEAVE,
+    NAME,
+    NONE,
+    VOID,
+    WHOLE,
+    Made,
+    OutsideError,
+    Several,
+    Text,
+    Value,
+    constant,
+    has_value,
+    item_of,
+    listed,
+    mangled,
+    place,
+    type_of,
+    valueless,
+)
+from experiments.virtual_time.laws import MEASURES, as_dictionary, keep, numbers, robot_name
+from experiments.virtual_time.records import FLOAT, INT, Items, RecordLayout
+
+if TYPE_CHECKING:
+    from experiments.virtual_time.translation import Program
+
+COMPARISONS: Final = {
+    ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!=", ast.Is: "==",
+    ast.IsNot: "!=",
+}  # fmt: skip
+BITS: Final = {ast.BitAnd: "&", ast.BitOr: "|", ast.BitXor: "^"}
+SUMS: Final = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*"}
+DIVISIONS: Final = {  # function of `arithmetic.c` by operator and type
+    (ast.Div, DOUBLE): "py_over", (ast.Mod, DOUBLE): "py_rest", (ast.Mod, WHOLE): "py_rest_i",
+    (ast.FloorDiv, DOUBLE): "py_floor_over", (ast.FloorDiv, WHOLE): "py_floor_i", (ast.Pow, DOUBLE): "py_power",
+    (ast.LShift, WHOLE): "py_left", (ast.RShift, WHOLE): "py_right",
+}  # fmt: skip
+OF_FLOATS: Final = "sqrt sin cos tan asin acos atan atan2 log exp expm1 tanh fabs copysign degrees radians"
+MATH: Final = {  # functions of `math`, with the types of their values
+    **dict.fromkeys(OF_FLOATS.split(), DOUBLE), **dict.fromkeys(("floor", "ceil", "trunc"), WHOLE),
+    **dict.fromkeys(("isfinite", "isinf", "isnan"), BOOLEAN),
+}  # fmt: skip
+BUILTINS: Final = {"abs", "bool", "float", "int", "len", "max", "min", "round"}
+NEW_SUMS: Final = (3, 12)  # Python that adds floats in another way
+SMALL: Final = 1 << 31  # a sum with a constant below this needs no check
+NAMED: Final[dict[type, str]] = {  # constructs outside of the subset
+    ast.JoinedStr: "an f-string", ast.Dict: "a dictionary", ast.Set: "a set", ast.List: "a list", ast.Try: "try",
+    ast.ListComp: "a comprehension", ast.SetComp: "a comprehension", ast.DictComp: "a comprehension", ast.With: "with",
+    ast.GeneratorExp: "a generator", ast.Lambda: "a lambda", ast.Starred: "*args", ast.Delete: "del",
+    ast.FunctionDef: "a function within it", ast.Slice: "a slice",
+}  # fmt: skip
+
+
+OF_RECORDS: Final = (as_dictionary, keep, numbers, robot_name)
+
+
+class Expressions(ast.NodeVisitor):
+    """Walk through a function; a visit of an expression gives its `Value`."""
+
+    def __init__(
+        self, program: Program, tree: ast.FunctionDef, space: dict[str, Any], function: FunctionType | None = None
+    ) -> None:
+        self._program, self._tree, self._space, self._function = program, tree, space, function
+        self._lines = list[str]()
+        self._count, self._ended = 0, False
+        self._locals, self._set = dict[str, Any](), set[str]()  # types, and names that have a value here in any case
+        self._result: Any = None  # type
+        self._names = dict[str, str]()  # names in C of variables of comprehensions
+        self.arguments: dict[str, Any] = {}
+
+    def error(self, node: ast.AST, what: str) -> OutsideError:
+        if self._function is None:
+            return OutsideError(f"{what}: {ast.unparse(node)}")
+        where = place(self._function, getattr(node, "lineno", 1))
+        return OutsideError(f"{where}: {self._function.__qualname__} uses {what}")
+
+    def generic_visit(self, node: ast.AST) -> Any:
+        raise self.error(node, NAMED.get(type(node), f"`{ast.unparse(node)[:40]}`"))
+
+    def emit(self, *lines: str) -> None:
+        self._lines += lines
+
+    def new(self) -> str:
+        self._count += 1
+        return f"_{self._count}"
+
+    def saved(self, value: Value) -> Value:
+        """The value as it is now, whatever follows."""
+        if value.parts is not None:
+            return value._replace(parts=[self.saved(each) for each in value.parts])
+        if value.constant is not ... or value.type == NONE:
+            return value
+        name = self.new()
+        self.emit(f"{self._program.c(value.type)} {name} = {value.text};")
+        return Value(value.type, name)
+
+    def aside(self, visit: Callable[[], Value]) -> tuple[Value, list[str]]:
+        """A value, and the statements before it, which are not made yet."""
+        mark = len(self._lines)
+        value = visit()
+        later = self._lines[mark:]
+        del self._lines[mark:]
+        return value, later
+
+    def several(self, nodes: Sequence[ast.expr]) -> list[Value]:
+        """Values in their order: what stands before a call is read before it."""
+        found = list[Value]()
+        for node in nodes:
+            value, later = self.aside(partial(self.visit, node))
+            if later:
+                found = [self.saved(each) for each in found]
+            self.emit(*later)
+            found.append(value)
+        return found
+
+    def one(self, value: Value) -> str:
+        """Text of a value, of a tuple too."""
+        if value.parts is None:
+            return value.text
+        parts = [self.one(each) for each in value.parts if has_value(each.type)]
+        return f"({self._program.c(value.type)}){{{', '.join(parts) or '0'}}}"
+
+    def parts(self, value: Value, node: ast.AST) -> Sequence[Value]:
+        """Parts of a tuple."""
+        if not isinstance(value.type, Several) or value.type.owner is not tuple:
+            raise self.error(node, "parts of something that is no tuple")
+        return self.members(value)
+
+    def members(self, value: Value) -> Sequence[Value]:
+        if value.parts is not None:
+            return value.parts
+        kinds = enumerate(value.type.parts)
+        return [Value(each, f"{value.text}._{k}") if has_value(each) else valueless(each) for k, each in kinds]
+
+    def of_type(self, value: Value, kind: Any, node: ast.AST) -> Value:
+        """The value; raises OutsideError if it has another type."""
+        if value.type != kind:
+            raise self.error(node, f"{listed(value.type)} where {listed(kind)} stands otherwise")
+        return value
+
+    def number(self, value: Value, kind: str, node: ast.AST) -> Value:
+        """The value as a number of this type, as Python's arithmetic takes it."""
+        if value.type == kind:
+            return value
+        if value.type not in (WHOLE, BOOLEAN) or kind == BOOLEAN:
+            raise self.error(node, f"{listed(value.type)} where a number belongs")
+        if value.constant is not ...:
+            return constant(float(value.constant) if kind == DOUBLE else int(value.constant))
+        return Value(kind, f"({kind})({value.text})")
+
+    def condition(self, node: ast.expr) -> Value:
+        """Whether an expression is true."""
+        if isinstance(node, ast.BoolOp):
+            return self.joined(node, self.condition)
+        if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
+            found = self.condition(node.operand)
+            return Value(BOOLEAN, f"(!{found.text})") if found.constant is ... else constant(not found.constant)
+        return self.truth(self.visit(node), node)
+
+    def truth(self, value: Value, node: ast.AST) -> Value:
+        if value.constant is not ...:
+            return constant(bool(value.constant))
+        if isinstance(value.type, Several) and value.type.owner in (tuple, dict):
+            return constant(bool(value.type.parts))
+        if isinstance(value.type, RecordLayout):
+            if any(hasattr(value.type.owner, name) for name in ("__bool__", "__len__")):
+                raise self.error(node, "the truth of an object")
+            return constant(True)
+        if isinstance(value.type, Items | Made):
+            return Value(BOOLEAN, f"({value.text}.count != 0)")
+        return value if value.type == BOOLEAN else Value(BOOLEAN, f"({value.text} != 0)")
+
+    def visit_Constant(self, node: ast.Constant) -> Value:
+        return self.known(node.value, node)
+
+    def visit_Tuple(self, node: ast.Tuple) -> Value:
+        parts = self.several(node.elts)
+        known = tuple(each.constant for each in parts) if all(each.constant is not ... for each in parts) else ...
+        return Value(Several(tuple(each.type for each in parts)), "", known, parts)
+
+    def visit_Name(self, node: ast.Name) -> Value:
+        if node.id in self._locals:
+            if node.id not in self._set:
+                raise self.error(node, f"{node.id}, which a branch or a loop leaves unset")
+            kind = self._locals[node.id]
+            return Value(kind, self._names.get(node.id) or mangled(node.id)) if has_value(kind) else valueless(kind)
+        return self.known(self.named(node.id), node)
+
+    def named(self, name: str) -> Any:
+        """Meaning of a name outside of the function, ... if it has none."""
+        return self._program.look(partial(self._space.get, name, getattr(builtins, name, ...)))
+
+    def known(self, found: Any, node: ast.AST) -> Value:
+        try:
+            return constant(found)
+        except TypeError as error:
+            name = "numpy" if getattr(found, "__name__", "").partition(".")[0] == "numpy" else ast.unparse(node)
+            raise self.error(node, name if isinstance(found, ModuleType) else f"{name}: {error}") from None
+
+    def of_module(self, node: ast.expr) -> Any:
+        """Object behind `module.name` or `Class.name`, ... if it is neither."""
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id not in self._locals:
+            owner = self.named(node.value.id)
+            if isinstance(owner, ModuleType | type):
+                return self._program.look(partial(getattr, owner, node.attr, None))
+        return ...
+
+    def visit_Attribute(self, node: ast.Attribute) -> Value:  # noqa: PLR0911 - one for each sort
+        if (found := self.of_module(node)) is not ...:
+            return self.known(found, node)
+        thing = self.visit(node.value)
+        layout, name = thing.type, node.attr
+        if isinstance(layout, Several) and name in layout.names and layout.owner is not dict:
+            return self.members(thing)[layout.names.index(name)]
+        if getattr(layout, "owner", None) is RobotFacts and name == "name":
+            return Value(NAME, f"{thing.text}->number")
+        if not isinstance(layout, RecordLayout):
+            raise self.error(node, f"an attribute of {listed(layout)}")
+        if name in layout.fields:
+            return Value(type_of(layout.fields[name]), f"{thing.text}->{mangled(name)}")
+        if name in layout.fixed:
+            return self.known(layout.fixed[name], node)
+        found = self._program.look(partial(inspect.getattr_static, layout.owner, name, ...))
+        if isinstance(found, property) and isinstance(found.fget, FunctionType):
+            return self.call(found.fget, [thing], {}, node)
+        if found is ...:
+            raise self.error(node, f"an attribute {name} that is not there")
+        return self.known(found, node)
+
+    def visit_Subscript(self, node: ast.Subscript) -> Value:
+        if isinstance(node.slice, ast.Slice):
+            parts, ends = (
+                self.parts(self.visit(node.value), node),
+                (node.slice.lower, node.slice.upper, node.slice.step),
+            )
+            kept = parts[slice(*(None if each is None else ast.literal_eval(each) for each in ends))]
+            return Value(Several(tuple(each.type for each in kept)), "", ..., kept)
+        items, k = self.several([node.value, node.slice])
+        if isinstance(k.type, Text) and isinstance(items.type, Several) and items.type.owner is dict:
+            if k.constant not in items.type.names:
+                raise self.error(node, f"{k.constant}, which a dictionary lacks")
+            return self.members(items)[items.type.names.index(k.constant)]
+        if isinstance(items.type, Several) and isinstance(k.constant, int):
+            parts = self.parts(items, node)
+            if not -len(parts) <= k.constant < len(parts):
+                raise self.error(node, "an index outside of a tuple")
+            return parts[k.constant]
+        return self.item(self.as_list(items, node), k, node)
+
+    def visit_Dict(self, node: ast.Dict) -> Value:
+        """A dictionary of constant texts: a value with names, in their order of letters."""
+        names = [each.value if isinstance(each, ast.Constant) else None for each in node.keys]
+        texts = [each for each in names if isinstance(each, str)]
+        if len({*texts}) < len(names):
+            raise self.error(node, "a dictionary without texts as keys")
+        values = dict(zip(texts, self.several(node.values), strict=True))
+        return self.with_names(dict, {name: values[name] for name in sorted(values)})
+
+    def with_names(self, owner: type, values: Mapping[str, Value]) -> Value:
+        kinds = tuple(each.type for each in values.values())
+        return Value(Several(kinds, (*values,), owner), "", ..., (*values.values(),))
+
+    def as_list(self, value: Value, node: ast.AST) -> Value:
+        """A list, or a tuple of numbers of one type as one."""
+        if not isinstance(value.type, Several):
+            return value
+        (kind, *others), name = [each.type for each in self.parts(value, node)] or [NONE], self.new()
+        if kind not in (DOUBLE, WHOLE) or any(each != kind for each in others):
+            raise self.error(node, "a loop over, or an index of, a tuple of several types")
+        items = Items(FLOAT if kind == DOUBLE else INT)
+        self.emit(f"{kind} {name}[] = {{{', '.join(self.one(each) for each in self.parts(value, node))}}};")
+        return Value(items, f"(({self._program.c(items)}){{{name}, {len(others) + 1}}})")
+
+    def item(self, items: Value, k: Value, node: ast.AST) -> Value:
+        """Item of a list; the function ends at an index that is not within it."""
+        if not isinstance(items.type, Items | Made):
+            raise self.error(node, f"an index of {listed(items.type)}")
+        name, count = self.new(), f"{items.text}.count"
+        self.emit(f"whole {name} = {self.number(k, WHOLE, node).text};")
+        if k.constant is ... or k.constant < 0:
+            self.emit(f"if ({name} < 0) {name} += {count};")
+        self.emit(f"if ((unsigned long long){name} >= (unsigned long long){count}) {{ fault = 1; {LEAVE} }}")
+        return Value(item_of(items.type), f"{items.text}.at[{name}]")
+
+    def visit_UnaryOp(self, node: ast.UnaryOp) -> Value:
+        if isinstance(node.op, ast.Not):
+            return self.condition(node)
+        found = self.visit(node.operand)
+        found = self.number(found, DOUBLE if found.type == DOUBLE else WHOLE, node)
+        if isinstance(node.op, ast.USub):
+            return Value(found.type, f"(-{found.text})") if found.constant is ... else constant(-found.constant)
+        if isinstance(node.op, ast.UAdd):
+            return found
+        return Value(WHOLE, f"(~{self.of_type(found, WHOLE, node).text})")
+
+    def visit_BinOp(self, node: ast.BinOp) -> Value:  # noqa: PLR0911 - one for each sort
+        (a, b), op = self.several([node.left, node.right]), type(node.op)
+        kind = WHOLE if {a.type, b.type} <= {WHOLE, BOOLEAN} else DOUBLE
+        if op in BITS and kind == WHOLE:
+            both = BOOLEAN if a.type == b.type == BOOLEAN else WHOLE
+            return Value(both, f"({a.text} {BITS[op]} {b.text})")
+        a, b = self.number(a, kind, node), self.number(b, kind, node)
+        if kind == WHOLE and op is ast.Div:
+            return Value(DOUBLE, f"py_over(py_exact({a.text}), py_exact({b.text}))")
+        if kind == WHOLE and op is ast.Pow:  # a negative exponent makes it a float
+            if b.constant is ... or not 0 <= b.constant < 64:
+                raise self.error(node, "a power of a whole number with an exponent that is no small constant")
+            return Value(WHOLE, f"py_product({a.text}, " * b.constant + "1LL" + ")" * b.constant)
+        if op in SUMS:
+            small = any(each.constant is not ... and abs(each.constant) < SMALL for each in (a, b))
+            if kind == WHOLE and op is ast.Mult:
+                return Value(WHOLE, f"py_product({a.text}, {b.text})")
+            return Value(kind, f"{'py_fits' * (kind == WHOLE and not small)}({a.text} {SUMS[op]} {b.text})")
+        if (op, kind) not in DIVISIONS:
+            raise self.error(node, f"`{ast.unparse(node)[:40]}`")
+        if op is ast.Div and b.constant not in (..., 0.0):
+            return Value(DOUBLE, f"({a.text} / {b.text})")
+        return Value(kind, f"{DIVISIONS[op, kind]}({a.text}, {b.text})")
+
+    def visit_BoolOp(self, node: ast.BoolOp) -> Value:
+        return self.joined(node, self.visit)
+
+    def joined(self, node: ast.BoolOp, visit: Callable[[ast.expr], Value]) -> Value:
+        """The value that decides, or the last one: what follows it is not computed."""
+        word, decides = ("||", True) if isinstance(node.op, ast.Or) else ("&&", False)
+        found, later = self.aside(partial(visit, node.values[-1]))
+        for each in reversed(node.values[:-1]):
+            following, after = found, later
+            found, later = self.aside(partial(visit, each))
+            if found.constant is not ...:
+                if bool(found.constant) != decides:
+                    found, later = following, [*later, *after]
+                continue
+            if found.type == following.type == BOOLEAN and not after:
+                found = Value(BOOLEAN, f"({found.text} {word} {following.text})")
+                continue
+            self.of_type(following, found.type, node)
+            kept = Value(found.type, self.new())
+            test = self.truth(kept, node)
+            if test.constant is not ...:
+                raise self.error(node, f"`and` or `or` of {listed(found.type)}")
+            later += [
+                f"{self._program.c(found.type)} {kept.text} = {found.text};",
+                f"if ({'!' * decides}{test.text}) {{",
+            ]
+            later += [*after, f"{kept.text} = {self.one(following)};", "}"]
+            found = kept
+        self.emit(*later)
+        return found
+
+    def visit_IfExp(self, node: ast.IfExp) -> Value:
+        test = self.condition(node.test)
+        if test.constant is not ...:
+            decided: Value = self.visit(node.body if test.constant else node.orelse)
+            return decided
+        a, first = self.aside(partial(self.visit, node.body))
+        b, second = self.aside(partial(self.visit, node.orelse))
+        self.of_type(b, a.type, node)
+        if not (first or second):
+            return Value(a.type, f"({test.text} ? {self.one(a)} : {self.one(b)})")
+        name = self.new()
+        self.emit(f"{self._program.c(a.type)} {name};", f"if ({test.text}) {{", *first, f"{name} = {self.one(a)};")
+        self.emit("} else {", *second, f"{name} = {self.one(b)};", "}")
+        return Value(a.type, name)
+
+    def visit_Compare(self, node: ast.Compare) -> Value:
+        values = [node.left, *node.comparators]
+        if len(node.ops) > 1:  # a < b < c is a < b and b < c, with b computed once
+            if any(map(calls, values[1:-1])):
+                raise self.error(node, "a call within a chain of comparisons")
+            each: list[ast.expr] = [
+                ast.Compare(a, [op], [b]) for a, op, b in zip(values, node.ops, values[1:], strict=False)
+            ]
+            whole = ast.BoolOp(ast.And(), [ast.copy_location(pair, node) for pair in each])
+            return self.joined(ast.copy_location(whole, node), self.visit)
+        (a, b), op = self.several(values), type(node.ops[0])
+        identity, word = op in (ast.Is, ast.IsNot), COMPARISONS.get(op, "")
+        if NONE in (a.type, b.type) and word:
+            return constant((a.type == b.type) == (word == "=="))
+        if isinstance(a.type, Text) and isinstance(b.type, Text) and op in (ast.Eq, ast.NotEq):
+            return constant((a.constant == b.constant) == (op is ast.Eq))
+        if {type(a.type), type(b.type)} == {str, Text} and NAME in (a.type, b.type) and op in (ast.Eq, ast.NotEq):
+            name, text = (a, b) if isinstance(b.type, Text) else (b, a)
+            return Value(BOOLEAN, f"({name.text} {word} {self._program.names.get(text.constant, -1)})")
+        same_object = identity and isinstance(a.type, RecordLayout) and a.type == b.type
+        if not word or not (same_object or ({a.type, b.type} <= {DOUBLE, WHOLE, BOOLEAN} and not identity)):
+            raise self.error(
+                node, f"a comparison of {listed(a.type)} by `{ast.unparse(node)[:40]}`" if word else "`in`"
+            )
+        if {a.type, b.type} == {DOUBLE, WHOLE}:  # Python compares the exact values
+            a, b = (
+                Value(DOUBLE, f"py_exact({each.text})") if each.type == WHOLE and each.constant is ... else each
+                for each in (a, b)
+            )
+        return Value(BOOLEAN, f"({a.text} {word} {b.text})")
+
+    # ------------------------------------------------------------------ calls
+
+    def visit_Call(self, node: ast.Call) -> Value:
+        is_name, owner = isinstance(node.func, ast.Name) and node.func.id not in self._locals, list[ast.expr]()
+        found = self.named(ast.unparse(node.func)) if is_name else self.of_module(node.func)
+        if found is ... and isinstance(node.func, ast.Attribute):  # a method
+            owner = [node.func.value]
+        elif not isinstance(found, FunctionType) or found in OF_RECORDS:
+            return self.builtin(found, node)
+        given, by_name = self.given(node, owner)
+        if owner and isinstance(node.func, ast.Attribute):
+            if isinstance(given[0].constant, Mapping) and node.func.attr == "get":
+                if len(given) != 3 or given[2].type == NONE:
+                    raise self.error(node, "`get` without a default")
+                return self.entry(given[0], given[1], given[2], node)
+            of = getattr(given[0].type, "owner", None)
+            found = self._program.look(partial(inspect.getattr_static, of, node.func.attr, None))
+        if not isinstance(found, FunctionType):
+            raise self.error(node, f"a call of {ast.unparse(node.func)}")
+        if found is RobotFacts.of and isinstance(given[1].constant, Mapping):
+            name, default = Value(NAME, f"{given[0].text}->number"), (*given[2:], *by_name.values(), constant(None))[0]
+            return self.entry(given[1], name, default, node)
+        return self.call(found, given, by_name, node)
+
+    def entry(self, table: Value, name: Value, default: Value, node: ast.AST) -> Value:
+        """Value of a robot in a constant table by names; without a default it must be there."""
+        numbers, found = self._program.names, self.new()
+        rows = {numbers[each]: constant(value) for each, value in table.constant.items() if each in numbers}
+        kinds = {each.type for each in (default, *rows.values()) if each.type != NONE}
+        if name.type != NAME or len(kinds) != 1 or not has_value(kind := kinds.pop()):
+            raise self.error(node, f"a table of {' or '.join(sorted(map(listed, kinds)))}")
+        self.emit(f"{self._program.c(kind)} {found};", f"switch ({name.text}) {{")
+        self.emit(*(f"case {row}: {found} = {self.one(value)}; break;" for row, value in rows.items()))
+        other = f"fault = 1; {LEAVE}" if default.type == NONE else f"{found} = {self.one(default)};"
+        self.emit(f"default: {other}", "}")
+        return Value(kind, found)
+
+    def given(self, node: ast.Call, owner: Sequence[ast.expr] = ()) -> tuple[list[Value], dict[str, Value]]:
+        """Arguments of a call by place, behind its owner, and by name."""
+        nodes = [*owner, *node.args, *(each.value for each in node.keywords)]
+        values = self.several([each.value if isinstance(each, ast.Starred) else each for each in nodes])
+        first = len(values) - len(node.keywords)
+        places = list[Value]()
+        for argument, value in zip(nodes[:first], values[:first], strict=True):
+            places += self.parts(value, node) if isinstance(argument, ast.Starred) else [value]
+        return places, dict(zip([each.arg or "*" for each in node.keywords], values[first:], strict=True))
+
+    def call(self, function: FunctionType, given: list[Value], by_name: Mapping[str, Value], node: ast.AST) -> Value:
+        rare = getattr(getattr(given[0].type, "owner", None), "RARE", ()) if given else ()
+        if function.__name__ not in rare:
+            return self.call_quiet(function, given, by_name, node)
+        program, name = self._program, function.__qualname__
+        mark = len(self._lines)
+        if name not in program.called_back:
+            try:
+                self.emit("rooms = 0;")
+                return self.call_quiet(program.instead.get(function, function), given, by_name, node)
+            except OutsideError as error:
+                del self._lines[mark:]
+                program.called_back[name] = str(error)
+        return self.call_back(given[0], rare.index(function.__name__), given[1:], node)
+
+    def call_quiet(
+        self, function: FunctionType, given: list[Value], by_name: Mapping[str, Value], node: ast.AST
+    ) -> Value:
+        parameters = inspect.signature(function).parameters
+        several = any(each.kind is each.VAR_POSITIONAL for each in parameters.values())
+        defaults = {name: each.default for name, each in parameters.items() if each.default is not each.empty}
+        rest = [] if several else [*parameters][len(given) :]
+        if (len(given) > len(parameters) and not several) or not by_name.keys() <= {
+            *rest
+        } <= by_name.keys() | defaults.keys():
+            raise self.error(node, f"a call of {function.__qualname__} with other arguments")
+        given = [*given, *(by_name[name] if name in by_name else self.known(defaults[name], node) for name in rest)]
+        name, result = self._program.function(function, [each.type for each in given])
+        texts = [self.one(each) for each in given if has_value(each.type)]
+        if several:
+            fixed = len(parameters) - 1
+            more = Value(Several(tuple(each.type for each in given[fixed:])), "", ..., given[fixed:])
+            texts = [self.one(each) for each in (*given[:fixed], more) if has_value(each.type)]
+        text = f"{name}({', '.join(texts)})"
+        if result == VOID:
+            self.emit(f"{text};", f"if (fault) {LEAVE}")
+            return constant(None)
+        found = self.saved(Value(result, text))
+        self.emit(f"if (fault) {LEAVE}")
+        return found
+
+    def call_back(self, thing: Value, which: int, given: Sequence[Value], node: ast.AST) -> Value:
+        """Call of a rare function of an object, in Python, with numbers; it returns nothing."""
+        parts = [part for each in given for part in (self.parts(each, node) if each.type != DOUBLE else [each])]
+        numbers, name = ", ".join(self.of_type(each, DOUBLE, node).text for each in parts), self.new()
+        self.emit(
+            f"double {name}[] = {{{numbers}}};",
+            f"if (back((whole){thing.text}, {which}, {name})) {{ fault = 1; {LEAVE} }}",
+        )
+        return constant(None)
+
+    def builtin(self, found: Any, node: ast.Call) -> Value:  # noqa: PLR0911, PLR0912 - one for each sort
+        """Value of a function of `math`, or of one that Python has by itself."""
+        name, called = getattr(found, "__name__", ""), ast.unparse(node.func)
+        if found in (View, NeighbourView, Control):
+            return self.made(found, node)
+        if found is robot_name:
+            number: Value = self.visit(node.args[0])
+            return number._replace(type=NAME)
+        if found in OF_RECORDS:
+            return self.of_variables(name, self.several(node.args), node)
+        if found in (math.hypot, math.dist):
+            return self.length(found, node)
+        if found is float and len(node.args) == 1 and isinstance(node.args[0], ast.JoinedStr):
+            return self.digits(node.args[0])
+        of_math = name in MATH and getattr(math, name) is found
+        if not of_math and not (name in BUILTINS and getattr(builtins, name) is found):
+            raise self.error(node, called if called.startswith("math.") else f"a call of {called}")
+        several, given = name in ("min", "max", "atan2", "copysign"), self.several(node.args)
+        if node.keywords or not given or (len(given) > 1 and not several):
+            raise self.error(node, "round to digits" if name == "round" else f"a call of {called} with other arguments")
+        first = given[0]
+        if of_math and MATH[name] == first.type == WHOLE:
+            return first
+        if of_math:
+            return Value(MATH[name], f"py_{name}({', '.join(self.number(each, DOUBLE, node).text for each in given)})")
+        if several:
+            values = self.parts(first, node) if len(given) == 1 else given
+            kind, text = values[0].type, values[0].text
+            for each in values[1:]:
+                text = f"py_{name}{'_i' * (kind == WHOLE)}({text}, {self.of_type(each, kind, node).text})"
+            return self.number(Value(kind, text), kind if kind == WHOLE else DOUBLE, node)
+        if name == "len":
+            items = isinstance(first.type, Items | Made)
+            return Value(WHOLE, f"{first.text}.count") if items else constant(len(self.parts(first, node)))
+        if name == "bool":
+            return self.truth(first, node)
+        if name == "float" or first.type != DOUBLE:
+            whole = self.number(first, DOUBLE if name == "float" else WHOLE, node)
+            return Value(WHOLE, f"py_abs_i({whole.text})") if name == "abs" else whole
+        return Value(DOUBLE if name == "abs" else WHOLE, f"py_{name}({first.text})")
+
+    def made(self, owner: Any, node: ast.Call) -> Value:
+        """An object that is a value."""
+        places, by_name = self.given(node)
+        parameters = inspect.signature(owner).parameters
+        given = dict(zip(parameters, places, strict=False)) | by_name
+        if len(given) < len(places) + len(by_name) or not given.keys() <= parameters.keys():
+            raise self.error(node, f"a call of {owner.__name__} with other arguments")
+        if owner is Control:
+            return self.control(given, node)
+        values = {
+            name: given[name] if name in given else self.known(parameters[name].default, node) for name in parameters
+        }
+        return self.with_names(owner, values)
+
+    def control(self, given: Mapping[str, Value], node: ast.Call) -> Value:
+        """A `Control`: of a velocity or goal that is left out, `gives` knows, and `measured` of measures."""
+        nothing = self.with_names(dict, {})
+        memory, measures = given.get("memory", nothing), given.get("measures", nothing)
+        values = {"memory": self.floats_of(memory, node)}
+        gives = measured = 0
+        for k, (name, other) in enumerate((("velocity", REST), ("goal", UNKNOWN)), 1):
+            value = given.get(name, constant(None))
+            gives = gives if value.type == NONE else k if gives == 0 else 3
+            values[name] = self.floats(constant(other) if value.type == NONE else value, node)
+        numbers, known = [constant(0.0)] * MEASURES, self._program.measures
+        for name, value in zip(measures.type.names, self.members(measures), strict=True):
+            if name not in known:
+                known.append(name)
+            if known.index(name) >= MEASURES or gives > 2 or len(values["velocity"].type.parts) != 3:
+                raise self.error(node, f"more than {MEASURES} measures, or a velocity beside a goal")
+            numbers[known.index(name)] = self.number(value, DOUBLE, node)
+            measured |= 1 << known.index(name)
+        values["yaw"] = self.number(given.get("yaw", constant(math.nan)), DOUBLE, node)
+        kinds = tuple(each.type for each in numbers)
+        values |= {"measures": Value(Several(kinds), "", ..., numbers), "gives": constant(gives)}
+        return self.with_names(Control, values | {"measured": constant(measured)})
+
+    def floats(self, value: Value, node: ast.AST) -> Value:
+        """A tuple of floats."""
+        parts = [self.number(each, DOUBLE, node) for each in self.parts(value, node)]
+        return Value(Several((DOUBLE,) * len(parts)), "", ..., parts)
+
+    def floats_of(self, value: Value, node: ast.AST) -> Value:
+        """A dictionary of tuples of floats."""
+        if not isinstance(value.type, Several) or value.type.owner is not dict:
+            raise self.error(node, f"{listed(value.type)} where a dictionary belongs")
+        members = zip(value.type.names, self.members(value), strict=True)
+        return self.with_names(dict, {name: self.floats(each, node) for name, each in members})
+
+    def of_variables(self, name: str, given: Sequence[Value], node: ast.AST) -> Value:
+        """Functions on the record of variables, see `experiments.virtual_time.laws`."""
+        (layout, text, *_), names = given[0], sorted(given[0].type.owner.NAMES)
+        fields = [Value(type_of(layout.fields[each]), f"{text}->{each}") for each in map(layout.owner.slot, names)]
+        if name == "numbers":
+            items = Items(FLOAT)
+            return Value(items, f"(({self._program.c(items)}){{(double *){text}, {layout.words * bool(names)}}})")
+        stored = self.with_names(dict, dict(zip(names, fields, strict=True)))
+        if name == "as_dictionary":
+            return stored
+        values = self.saved(self.floats_of(given[1], node))
+        self.of_type(values, stored.type, node)
+        for field, value in zip(fields, self.members(values), strict=True):
+            self.emit(f"{field.text} = {self.one(value)};")
+        return constant(None)
+
+    def length(self, found: Any, node: ast.Call) -> Value:
+        """`hypot` and `dist`: Python's own sums, which it changed."""
+        given = self.several(node.args)
+        if found is math.dist:
+            a, b = (self.floats(each, node).parts for each in given)
+            given = [Value(DOUBLE, f"({x.text} - {y.text})") for x, y in zip(a or (), b or (), strict=True)]
+        if sys.version_info >= NEW_SUMS:
+            raise self.error(node, f"{ast.unparse(node.func)}, of which this Python has another last digit")
+        values = [self.number(each, DOUBLE, node).text for each in given]
+        return Value(DOUBLE, f"py_hypot({len(values)}, (double[]){{{', '.join(values)}}})")
+
+    def digits(self, node: ast.JoinedStr) -> Value:
+        """`float(f"{x:.7g}")`."""
+        (shown,) = node.values if len(node.values) == 1 else [None]
+        spec = getattr(shown, "format_spec", None)
+        parts = [each.value for each in getattr(spec, "values", ())]
+        texts = [str(each if isinstance(each, str) else self.visit(each).constant) for each in parts]
+        if not isinstance(shown, ast.FormattedValue) or not re.fullmatch(r"\.\d+g", "".join(texts)):
+            raise self.error(node, NAMED[ast.JoinedStr])
+        value = self.number(self.visit(shown.value), DOUBLE, node)
+        return Value(DOUBLE, f"py_digits({value.text}, {''.join(texts)[1:-1]})")
+
+
+def calls(node: ast.AST) -> bool:
+    return any(isinstance(each, ast.Call) for each in ast.walk(node))
