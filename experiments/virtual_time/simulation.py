@@ -388,7 +388,8 @@ class LawColumns:
     def extend(self, count: int, columns: dict[str, Array]) -> None:
         """Add columns over `count` samples."""
         self._settle()
-        self._parts.append((count, columns))
+        if count:
+            self._parts.append((count, columns))
 
     def columns(self) -> dict[str, Array]:
         """(K, N) of numbers, (K, N, k) of tuples; NaN where a robot has no such value."""
