@@ -19,11 +19,11 @@ from agents.robot import Robot
 from experiments.definition.plan import Plan
 from experiments.virtual_time import company, laws, machine
 from experiments.virtual_time.company import AT_END, Crew, Ledger, Member, Planned, Way
-from experiments.virtual_time.kinds import BOOLEAN, DOUBLE, WHOLE, OutsideError
 from experiments.virtual_time.network import VirtualNetwork
 from experiments.virtual_time.records import Image, Layouts, RecordLayout
 from experiments.virtual_time.steps import Steps
-from experiments.virtual_time.translation import Program
+from experiments.virtual_time.translator.kinds import BOOLEAN, DOUBLE, WHOLE, OutsideError
+from experiments.virtual_time.translator.translation import Program
 from twins.body import TwinBody
 
 TICK_S: Final = 15e-6  # [s] CPU time of a tick of a robot in plain Python: 10 to 20 µs

@@ -43,7 +43,7 @@ def test_a_wheel_has_the_names_for_plugins(tmp_path):
     inside = zipfile.ZipFile(wheel).namelist()
     assert {name.partition(".data/purelib/")[2] for name in inside} >= {"zenpark/__init__.py", "zenpark/py.typed"}
     assert {"experiments/api.py", "agents/py.typed", "twins/py.typed", "experiments/py.typed"} <= {*inside}
-    assert "experiments/virtual_time/arithmetic.c" in inside
+    assert "experiments/virtual_time/translator/arithmetic.c" in inside
 
 
 def stamp(bootstrap, level):

@@ -18,10 +18,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from experiments.virtual_time import machine, translation
-from experiments.virtual_time.kinds import LARGEST, WHOLE, OutsideError
+from experiments.virtual_time import machine
 from experiments.virtual_time.records import Image, Layouts
-from experiments.virtual_time.translation import Program
+from experiments.virtual_time.translator import translation
+from experiments.virtual_time.translator.kinds import LARGEST, WHOLE, OutsideError
+from experiments.virtual_time.translator.translation import Program
 from tests.cases import examples
 from tests.commands import ROOT
 from tests.experiments.virtual_time.constructs import CONSTRUCTS, ROWS, Case

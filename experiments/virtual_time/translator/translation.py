@@ -21,8 +21,9 @@ from pathlib import Path
 from types import FunctionType
 from typing import Any, Final, NamedTuple
 
-from experiments.virtual_time.expressions import NEW_SUMS, Expressions, calls
-from experiments.virtual_time.kinds import (
+from experiments.virtual_time.records import Items, RecordLayout
+from experiments.virtual_time.translator.expressions import NEW_SUMS, Expressions, calls
+from experiments.virtual_time.translator.kinds import (
     BOOLEAN,
     DOUBLE,
     LEAVE,
@@ -33,7 +34,7 @@ from experiments.virtual_time.kinds import (
     Made,
     OutsideError,
     Several,
-    Text,
+    TextType,
     Value,
     constant,
     has_value,
@@ -43,7 +44,6 @@ from experiments.virtual_time.kinds import (
     place,
     type_of,
 )
-from experiments.virtual_time.records import Items, RecordLayout
 
 ARITHMETIC: Final = Path(__file__).with_name("arithmetic.c")
 TURNS: Final = 10**9  # turns of all loops of a stretch: some seconds
@@ -97,7 +97,7 @@ class Program:
         """C's name of a type."""
         if isinstance(kind, str):
             return kind
-        if isinstance(kind, Text):
+        if isinstance(kind, TextType):
             return f"text {kind.value}"  # part of names of functions alone
         key = id(kind) if isinstance(kind, RecordLayout) else kind  # layouts are kept for ever
         if key not in self._names:
@@ -318,7 +318,7 @@ class Walk(Expressions):
 
     def bind(self, target: ast.expr, value: Value) -> None:
         """Let a variable of a loop stand for a value, of a text too."""
-        if isinstance(target, ast.Name) and isinstance(value.type, Text):
+        if isinstance(target, ast.Name) and isinstance(value.type, TextType):
             self._locals[target.id] = value.type
             self._set.add(target.id)
         else:

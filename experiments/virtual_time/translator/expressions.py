@@ -1,6 +1,5 @@
 """Expressions in C: each visit gives a `Value`, and emits the statements that come before it."""
 
-# ruff: noqa: ANN401 - constants and types
 from __future__ import annotations
 
 import ast
@@ -12,12 +11,14 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from types import FunctionType, ModuleType
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final, Protocol
 
 from agents.decision.stepping import REST
 from agents.plugins.law import Control, NeighbourView, RobotFacts, View
 from agents.vectors import UNKNOWN
-from experiments.virtual_time.kinds import (
+from experiments.virtual_time.laws import MEASURES, as_dictionary, keep, numbers, robot_name
+from experiments.virtual_time.records import FLOAT, INT, Items, RecordLayout
+from experiments.virtual_time.translator.kinds import (
     BOOLEAN,
     DOUBLE,
     LEAVE,
@@ -28,7 +29,7 @@ from experiments.virtual_time.kinds import (
     Made,
     OutsideError,
     Several,
-    Text,
+    TextType,
     Value,
     constant,
     has_value,
@@ -39,11 +40,6 @@ from experiments.virtual_time.kinds import (
     type_of,
     valueless,
 )
-from experiments.virtual_time.laws import MEASURES, as_dictionary, keep, numbers, robot_name
-from experiments.virtual_time.records import FLOAT, INT, Items, RecordLayout
-
-if TYPE_CHECKING:
-    from experiments.virtual_time.translation import Program
 
 COMPARISONS: Final = {
     ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!=", ast.Is: "==",
@@ -75,11 +71,29 @@ NAMED: Final[dict[type, str]] = {  # constructs outside of the subset
 OF_RECORDS: Final = (as_dictionary, keep, numbers, robot_name)
 
 
+class Translated(Protocol):
+    """Program that functions belong to."""
+
+    names: Mapping[str, int]
+    measures: list[str]
+    instead: Mapping[Any, Any]
+    called_back: dict[str, str]
+
+    def c(self, kind: Any) -> str:
+        """C's name of a type."""
+
+    def look(self, way: Callable[[], Any]) -> Any:
+        """Present meaning of a name."""
+
+    def function(self, function: FunctionType, types: Sequence[Any]) -> tuple[str, Any]:
+        """C's name of a function for arguments of these types, and the type of its result."""
+
+
 class Expressions(ast.NodeVisitor):
     """Walk through a function; a visit of an expression gives its `Value`."""
 
     def __init__(
-        self, program: Program, tree: ast.FunctionDef, space: dict[str, Any], function: FunctionType | None = None
+        self, program: Translated, tree: ast.FunctionDef, space: dict[str, Any], function: FunctionType | None = None
     ) -> None:
         self._program, self._tree, self._space, self._function = program, tree, space, function
         self._lines = list[str]()
@@ -257,7 +271,7 @@ class Expressions(ast.NodeVisitor):
             kept = parts[slice(*(None if each is None else ast.literal_eval(each) for each in ends))]
             return Value(Several(tuple(each.type for each in kept)), "", ..., kept)
         items, k = self.several([node.value, node.slice])
-        if isinstance(k.type, Text) and isinstance(items.type, Several) and items.type.owner is dict:
+        if isinstance(k.type, TextType) and isinstance(items.type, Several) and items.type.owner is dict:
             if k.constant not in items.type.names:
                 raise self.error(node, f"{k.constant}, which a dictionary lacks")
             return self.members(items)[items.type.names.index(k.constant)]
@@ -398,10 +412,10 @@ class Expressions(ast.NodeVisitor):
         identity, word = op in (ast.Is, ast.IsNot), COMPARISONS.get(op, "")
         if NONE in (a.type, b.type) and word:
             return constant((a.type == b.type) == (word == "=="))
-        if isinstance(a.type, Text) and isinstance(b.type, Text) and op in (ast.Eq, ast.NotEq):
+        if isinstance(a.type, TextType) and isinstance(b.type, TextType) and op in (ast.Eq, ast.NotEq):
             return constant((a.constant == b.constant) == (op is ast.Eq))
-        if {type(a.type), type(b.type)} == {str, Text} and NAME in (a.type, b.type) and op in (ast.Eq, ast.NotEq):
-            name, text = (a, b) if isinstance(b.type, Text) else (b, a)
+        if {type(a.type), type(b.type)} == {str, TextType} and NAME in (a.type, b.type) and op in (ast.Eq, ast.NotEq):
+            name, text = (a, b) if isinstance(b.type, TextType) else (b, a)
             return Value(BOOLEAN, f"({name.text} {word} {self._program.names.get(text.constant, -1)})")
         same_object = identity and isinstance(a.type, RecordLayout) and a.type == b.type
         if not word or not (same_object or ({a.type, b.type} <= {DOUBLE, WHOLE, BOOLEAN} and not identity)):

@@ -1,6 +1,5 @@
-"""Types and values of the functions in C, as `experiments.virtual_time.translation` knows them."""
+"""Types and values of the functions in C, as `experiments.virtual_time.translator.translation` knows them."""
 
-# ruff: noqa: ANN401 - values of a law
 from __future__ import annotations
 
 import inspect
@@ -53,7 +52,7 @@ class Made:
 
 
 @dataclass(frozen=True)
-class Text:
+class TextType:
     """Type of one text."""
 
     value: str
@@ -82,18 +81,18 @@ def item_of(kind: Any) -> Any:
 
 def has_value(kind: Any) -> bool:
     """Whether C knows values of a type."""
-    return kind != NONE and not isinstance(kind, Text)
+    return kind != NONE and not isinstance(kind, TextType)
 
 
 def valueless(kind: Any) -> Value:
     """Value of None or of a text."""
-    return constant(kind.value if isinstance(kind, Text) else None)
+    return constant(kind.value if isinstance(kind, TextType) else None)
 
 
 def listed(kind: Any) -> str:
     """A type in words."""
-    if isinstance(kind, Text | Made | Items):
-        return "a text" if isinstance(kind, Text) else "a list"
+    if isinstance(kind, TextType | Made | Items):
+        return "a text" if isinstance(kind, TextType) else "a list"
     if isinstance(kind, Several) and kind.owner is tuple:
         return f"a tuple of {len(kind.parts)}"
     return f"an object of {kind.owner.__name__}" if isinstance(kind, RecordLayout | Several) else WORDS[kind]
@@ -109,7 +108,7 @@ def constant(x: Any) -> Value:
         text = x.hex() if math.isfinite(x) else "unknown.number" if math.isnan(x) else "inf" if x > 0.0 else "-inf"
         return Value(DOUBLE, f"({text})", x)
     if isinstance(x, str):
-        return Value(Text(x), "0", x)
+        return Value(TextType(x), "0", x)
     if not isinstance(x, tuple | list | Mapping):
         raise TypeError(f"a {type(x).__name__}, which is no number")
     parts = [constant(each) for each in x]  # keys of a dictionary

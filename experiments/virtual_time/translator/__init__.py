@@ -1,0 +1,5 @@
+"""From functions in Python to text in C: types and values, expressions, statements.
+
+May import: agents.decision.stepping, agents.plugins.law, agents.vectors, experiments.virtual_time.records,
+experiments.virtual_time.laws.
+"""
