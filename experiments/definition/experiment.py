@@ -72,13 +72,6 @@ class Rates(FileTable, frozen=True):
     pose_hz: Annotated[Rate, doc("rate of questions to the trigger [1/s]")] = 50.0
     coordination_hz: Annotated[Rate, doc("rate of decisions on a new goal [1/s]")] = 10.0
     state_hz: Annotated[Rate, doc("telemetry for recorder and viewers [1/s]")] = 50.0
-    wake: Annotated[
-        bool | None,
-        doc(
-            "whether poses in real time are received on arrival, not on the next tick of body_hz; left out: yes, "
-            "unless the trigger is timed"
-        ),
-    ] = None
 
 
 class RobotTable(FileTable, frozen=True):

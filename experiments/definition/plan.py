@@ -121,8 +121,7 @@ class Plan:
     @property
     def wakes(self) -> bool:
         """Whether poses of neighbours wake a robot's process: each costs CPU time, and timed triggers send many."""
-        chosen = self.experiment.rates.wake
-        return not self.trigger.TIMED if chosen is None else chosen
+        return not self.trigger.TIMED
 
     @property
     def update_name(self) -> str:
