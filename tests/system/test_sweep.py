@@ -14,9 +14,9 @@ from tests.system.lab import options, until
 
 pytestmark = pytest.mark.system
 
-GIVEN = ["trigger.threshold=0.002:0.05:log6", "seeds=6"]
+GIVEN = ["trigger.threshold=0.002:0.05:log4", "seeds=5"]
 SETTINGS = ["duration_s=2.0"]
-RUNS = 7 * 6
+RUNS = 5 * 5
 
 
 def begun_sweep(folder, *more, given=GIVEN):

@@ -34,9 +34,9 @@ def recorded_run(tmp_path_factory):
 @pytest.mark.slow
 def test_film_shows_the_run_from_start_to_end(recorded_run):
     file = recorded_run[0] / "film.gif"
-    commands.export(str(recorded_run[0]), video=file, speed=8.0)
+    commands.export(str(recorded_run[0]), video=file, speed=20.0)
     with Image.open(file) as film:
-        assert film.n_frames == math.ceil(4.0 / (8.0 / export.FRAMES_HZ))
+        assert film.n_frames == math.ceil(4.0 / (20.0 / export.FRAMES_HZ))
         pictures = []
         for frame in (0, film.n_frames - 1):
             film.seek(frame)

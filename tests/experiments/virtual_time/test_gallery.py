@@ -20,7 +20,7 @@ from experiments.catalogue import index
 from experiments.definition.standby import without_standby
 from experiments.file import document
 from experiments.virtual_time.simulation import simulate
-from tests.cases import mostly_slow
+from tests.cases import nightly
 from tests.experiments.virtual_time.evaluators import played_back
 from tests.runs import flown, fly
 
@@ -82,10 +82,15 @@ def exchange(law, x, memory, rounds, *, links=(NOWHERE, NOWHERE), **facts):
     return controls
 
 
-AVERAGES = ("periodic", 1e-4, ()), ("event", 0.015, ()), ("event-loss", 0.02, ()), ("periodic", 1e-4, (CENTRALISED,))
+AVERAGES = [
+    ("event-loss", 0.02, ()),
+    pytest.param("periodic", 1e-4, (CENTRALISED,), marks=pytest.mark.slow),
+    nightly("periodic", 1e-4, ()),
+    nightly("event", 0.015, ()),
+]
 
 
-@pytest.mark.parametrize(("case", "most", "changes"), mostly_slow(AVERAGES, len(AVERAGES)))
+@pytest.mark.parametrize(("case", "most", "changes"), AVERAGES)
 def test_average_of_constant_signals_has_no_error(case, most, changes):
     known = flown("average", case, *changes).trace
     assert np.abs(known.memory["x"][-1] - 3.0).max() < most
@@ -139,10 +144,15 @@ def test_robots_fly_to_the_tasks_that_they_won(case):
 
 
 OFFSETS = np.array([[0.5, 0.0], [0.15, 0.48], [-0.4, 0.29], [-0.4, -0.29], [0.15, -0.48]])
-MEETINGS = ("periodic", (CENTRALISED,)), ("periodic", ()), ("event-loss", ()), ("periodic", (HYBRID,))
+MEETINGS = [
+    ("periodic", (CENTRALISED,)),
+    pytest.param("periodic", (HYBRID,), marks=pytest.mark.slow),
+    pytest.param("event-loss", (), marks=pytest.mark.slow),
+    nightly("periodic", ()),
+]
 
 
-@pytest.mark.parametrize(("case", "changes"), mostly_slow(MEETINGS, len(MEETINGS)))
+@pytest.mark.parametrize(("case", "changes"), MEETINGS)
 def test_consensus_meets_mean_at_the_graphs_rate(case, changes):
     known = flown("consensus", case, *changes).trace
     mean = (known.true_position[..., :2] - OFFSETS).mean(axis=1)
