@@ -102,7 +102,6 @@ class PolicyTrigger(Trigger, frozen=True):
     of the robot's links [m], 0 where it is unknown.
     """
 
-    JUDGES_ERRORS: ClassVar[bool] = True
     LIBRARY: ClassVar[str] = "onnxruntime"
     FILES: ClassVar[Mapping[str, str]] = {"file": "model"}
 

@@ -52,7 +52,7 @@ def flown(log, count, hz=10.0):
     return log.true_position[[int(np.argmin(abs(log.time - (k + 1) / hz))) for k in range(count)]]
 
 
-HEAVY = {"crowd", "mixed-reality"}  # 32 robots, and sensors of range
+HEAVY = {"crowd", "endurance", "mixed-reality", "mpc", "obstacle-course"}  # many robots, or dear ones
 CHECKED = [pytest.param(*each, marks=[pytest.mark.nightly] if each[0] in HEAVY else []) for each in FILES]
 
 
