@@ -36,7 +36,7 @@ from tests.simulated.faults import Fault
 from tests.simulated.kernel import KILLED
 from tests.simulated.look import Look, Seen
 from tests.simulated.rules import Rules
-from tests.simulated.world import LOOK_S, World
+from tests.simulated.world import LOOK_S, OUTSIDE, World
 
 BEGIN_S: Final = 90.0  # limit for the common start
 GONE_S: Final = 60.0  # time after the end of a run in which its processes must have ended
@@ -326,7 +326,7 @@ class RealWorld(World):
             self._end()
 
     def _left(self) -> list[Any]:
-        return [each for each in self.kernel.processes if not (each.dead or each.name.startswith("operator"))]
+        return [each for each in self.kernel.processes if not (each.dead or each.name.startswith(OUTSIDE))]
 
     def _work(self) -> None:
         self.kernel.work()
