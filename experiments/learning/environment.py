@@ -45,6 +45,28 @@ Infos = dict[str, dict[str, Any]]
 PENALTY: Final = 50.0  # loss of a robot that ends early
 
 
+class StatePickler(pickle.Pickler):
+    """Writes a state without what all states of an environment share: its place in `shared` stands for it."""
+
+    def __init__(self, buffer: io.BytesIO, shared: Sequence[object]) -> None:
+        super().__init__(buffer, pickle.HIGHEST_PROTOCOL)
+        self._places = {id(each): number for number, each in enumerate(shared)}
+
+    def persistent_id(self, obj: object) -> int | None:
+        return self._places.get(id(obj))
+
+
+class StateUnpickler(pickle.Unpickler):
+    """Reads a state that `Environment.save` made in this process."""
+
+    def __init__(self, state: bytes, shared: Sequence[object]) -> None:
+        super().__init__(io.BytesIO(state))
+        self._shared = shared
+
+    def persistent_load(self, pid: int) -> object:
+        return self._shared[pid]
+
+
 class Environment(ParallelEnv):  # type: ignore[misc] # it has no types
     """A case of an experiment as an environment; its agents are the robots that the law moves."""
 
@@ -171,9 +193,7 @@ class Environment(ParallelEnv):  # type: ignore[misc] # it has no types
         Raises LearningError where the engine keeps none.
         """
         buffer = io.BytesIO()
-        pickler = pickle.Pickler(buffer, pickle.HIGHEST_PROTOCOL)
-        places = {id(each): number for number, each in enumerate(self._shared)}
-        pickler.persistent_id = lambda each: places.get(id(each))  # type: ignore[method-assign]
+        pickler = StatePickler(buffer, self._shared)
         try:
             pickler.dump((self.seed, self.agents, self._run))
         except TypeError as error:  # a foreign engine
@@ -182,9 +202,7 @@ class Environment(ParallelEnv):  # type: ignore[misc] # it has no types
         return buffer.getvalue()
 
     def _restore(self, state: bytes) -> None:
-        unpickler = pickle.Unpickler(io.BytesIO(state))  # noqa: S301 - made by `save`, in this process
-        unpickler.persistent_load = self._shared.__getitem__  # type: ignore[method-assign]
-        self.seed, self.agents, self._run = unpickler.load()
+        self.seed, self.agents, self._run = StateUnpickler(state, self._shared).load()
 
     @cached_property
     def _shared(self) -> list[object]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, Final
+from typing import Any, Final, SupportsFloat
 
 import msgspec
 import numpy as np
@@ -322,7 +322,7 @@ def _number(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def _share(part: float, whole: float) -> float | None:
+def _share(part: SupportsFloat, whole: SupportsFloat) -> float | None:
     return float(part) / float(whole) if whole else None
 
 

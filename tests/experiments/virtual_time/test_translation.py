@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 from experiments.virtual_time import machine
 from experiments.virtual_time.records import Image, Layouts
 from experiments.virtual_time.translator import translation
+from experiments.virtual_time.translator.expressions import NEW_SUMS
 from experiments.virtual_time.translator.kinds import LARGEST, WHOLE, OutsideError
 from experiments.virtual_time.translator.translation import Program
 from tests.cases import examples
@@ -125,6 +126,8 @@ def cases(count, seed=5):
 @pytest.mark.parametrize("often", COMPILERS)
 @pytest.mark.parametrize("construct", CONSTRUCTS, ids=lambda each: each.__name__)
 def test_construct_is_that_of_python(construct, often):
+    if construct.__name__ in {"generators", "lengths"} and sys.version_info >= NEW_SUMS:
+        pytest.skip("this Python adds floats in another way: such functions are called back")
     plain = [outcome(construct, case) for case in cases(600)]
     shape = next(each for each in plain if each is not None)
     found = compiled(construct, shape, cases(600), often=often)
