@@ -6,10 +6,16 @@ from pathlib import Path
 
 import pytest
 
-from tests.simulated import look
+from tests.simulated import look, rules
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
+# the module of rules fills the registries when it is imported
+assert rules.OF_ROBOTS is look.OF_ROBOTS
 ALL = [*look.OF_ROBOTS, *look.OF_PAIRS, *look.OF_COMMANDS, *look.OF_POSES, *look.AT_THE_END]
+
+
+def test_all_rules_are_here():
+    assert len(ALL) > 30
 
 
 def test_rules_quote_the_documentation():
