@@ -172,16 +172,17 @@ def _is_option(part: click.Parameter) -> bool:
 def metrics() -> Iterator[str]:
     """Metrics, which are the columns of metrics.csv and the fields of metrics.json."""
     from experiments.metrics import results  # noqa: PLC0415
-    from experiments.metrics.metric import OURS  # noqa: PLC0415
+    from experiments.metrics.metric import FIGURES  # noqa: PLC0415
 
     yield "# Metrics and CSV columns\n"
     yield (
         "`metrics.csv` has a row per case and robot and a row `mean` per case (over the robots with `in_mean` 1), with"
         " the fields of `RobotMetrics` as columns; those of a later phase begin with `phase2_`, of the closest approach"
-        " with `near_` and `near_arena_`, of the shadow twin with `shadow_`. `metrics.json` has everything below.\n"
+        " with `near_` and `near_arena_`, of the shadow twin with `shadow_`. `metrics.json` has everything below;"
+        " fields without a text are metrics of the first table.\n"
     )
     yield from ("| metric | head | definition |", "|---|---|---|")
-    yield from (f"| `{name}` | {each.head} | {_cell(each.meaning)} |" for name, each in OURS.items())
+    yield from (f"| `{name}` | {each.head} | {_cell(each.meaning)} |" for name, each in FIGURES.items())
     yield from _structs(results)
 
 

@@ -32,15 +32,16 @@ def columns(trace: Trace, net: Links) -> dict[str, list[Any]]:
     counted = np.zeros((rows, rows), dtype=bool)  # links for avoidance alone do not belong to the formation
     counted[net.receiver, net.sender] = ~guided[net.receiver]
     taken = trace.received.link[counted[ends.receiver, ends.sender][trace.received.link]]
+    nothing = np.zeros(rows, dtype=np.intp)
     found = {
         "receivers": np.bincount(net.sender[~guided[net.receiver]], minlength=rows) + to_centre,
-        "received": np.bincount(ends.sender[taken], minlength=rows),
+        "received": np.bincount(ends.sender[taken], minlength=rows) + (nothing if goals is None else goals.received),
+        "goals": nothing if goals is None else np.bincount(goals.sent.link, minlength=rows),
+        "goal_bytes": nothing
+        if goals is None
+        else np.bincount(goals.sent.link, weights=goals.sent.bytes, minlength=rows).astype(np.intp),
     }
     delays = [_delays(np.zeros(0) if goals is None else goals.delay[goals.follower == row]) for row in range(rows)]
-    if goals is not None:
-        size = np.bincount(goals.sent.link, weights=goals.sent.bytes, minlength=rows).astype(np.intp)
-        found["received"] += goals.received
-        found |= {"goals": np.bincount(goals.sent.link, minlength=rows), "goal_bytes": size}
     return {name: column.tolist() for name, column in found.items()} | {
         name: [each[name] for each in delays] for name in delays[0]
     }

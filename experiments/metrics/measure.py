@@ -18,11 +18,10 @@ import numpy as np
 from agents.network.messages import Event
 from agents.safety.hazards import BY_OPERATOR, OVER, QUIET_S, UNRESOLVED, Cause, failed, is_blind
 from experiments.definition import link_conditions
-from experiments.definition.graph import Links
 from experiments.metrics import centralised
-from experiments.metrics.clearance import collisions
 from experiments.metrics.comparable import STOOD, reasons
 from experiments.metrics.metric import (
+    DETAILS,
     OF_LAW,
     case_values,
     known_metrics,
@@ -32,11 +31,10 @@ from experiments.metrics.metric import (
     unusable_metrics,
     values_of,
 )
-from experiments.metrics.results import Approach, Belief, CaseMetrics, Collision, LawMeasure, RobotMetrics
+from experiments.metrics.results import Approach, Belief, CaseMetrics, LawMeasure, RobotMetrics
 from experiments.metrics.shadow import agreement
 from experiments.metrics.signals import Measurement, link_deliveries, mean_known, outside_arena
 from experiments.recording.trace import Trace
-from twins.arrays import norm
 
 TROUBLES: Final = ("late", "unread")  # kinds of events of the run itself, not of a robot
 PRESENT: Final = 0.8  # least share of known positions of a robot: below it the robot was out of reach
@@ -59,7 +57,7 @@ def measure(trace: Trace) -> CaseMetrics:
     asked, missing = metrics_of_criteria(trace.plan.experiment.criteria)
     metrics, left_out = known_metrics() | asked | law_metrics(measures_of(trace)), unusable_metrics()
     shared = Measurement.of(trace)
-    values, faults = values_of(metrics, shared)
+    values, faults = values_of(metrics | DETAILS, shared)
     mean = case_values(metrics, values, shared.kept)
     names, errors, belief = trace.robots, shared.errors, shared.belief
     gaps = errors.gaps()
@@ -68,12 +66,8 @@ def measure(trace: Trace) -> CaseMetrics:
     farthest = int(beyond.argmax())
     rms = np.sqrt(mean_known(belief**2))
     largest = np.where(np.isfinite(belief), belief, -np.inf).max(axis=0, initial=-np.inf)
-    touched = collisions(trace, shared.clearance)
-    columns: dict[str, Sequence[Any]] = {name: values[name] for name in metrics if metrics[name].per == "robot"}
-    columns |= centralised.columns(trace, errors.net)
     guidance, arrived = centralised.guidance(trace), centralised.deliveries(trace)
-    columns |= {"shadow": agreement(trace)}
-    robots = _robots(shared, touched, columns)
+    robots = _robots(shared, {name: values[name] for name, each in (metrics | DETAILS).items() if each.per == "robot"})
     ticks, missed = int(trace.ticks.sum()), int(trace.missed_deadlines.sum())
     found = CaseMetrics(
         case=trace.case,
@@ -102,7 +96,7 @@ def measure(trace: Trace) -> CaseMetrics:
         modelled=link_conditions.models_network(trace.plan),
         missed_deadlines=missed,
         missed_share=_share(missed, ticks + missed),
-        collisions=touched,
+        collisions=shared.collisions,
         watched=trace.contacts is not None,
         near=_nearest(shared.clearance.robots),
         near_arena=_nearest(shared.clearance.arena),
@@ -130,49 +124,26 @@ def measure(trace: Trace) -> CaseMetrics:
     return msgspec.structs.replace(found, spoiled=reasons(found))
 
 
-def _robots(
-    shared: Measurement, touched: Sequence[Collision], found: Mapping[str, Sequence[Any]]
-) -> tuple[RobotMetrics, ...]:
-    """Metrics of each robot, from the contacts and from columns (N,) that were `found` elsewhere."""
-    trace, clearance = shared.trace, shared.clearance
-    first = shared.phases[0]
-    rows, experiment = range(len(trace.robots)), trace.plan.experiment
-    nothing = [None] * len(trace.robots)
-    duration = float(trace.time[-1] - trace.time[0])
-    contacts = [[each for each in touched if name in {each.first, each.second}] for name in trace.robots]
-    settled = [duration if when is None else when for when in shared.settled] if shared.has_errors else nothing
-    fields = RobotMetrics.__struct_fields__
-    extra = {name: column for name, column in found.items() if name not in fields}
-    columns: dict[str, Sequence[Any]] = {  # N values each
-        **{name: column for name, column in found.items() if name in fields},
+def _robots(shared: Measurement, values: Mapping[str, Sequence[float | None]]) -> tuple[RobotMetrics, ...]:
+    """Metrics of each robot, from the `values` (N,) of figures."""
+    trace, fields = shared.trace, RobotMetrics.__struct_fields__
+    first, *later = shared.phases
+    columns: dict[str, Sequence[Any]] = {
+        **values,
         "robot": trace.robots,
-        "kind": [experiment.robots[name].kind for name in trace.robots],
-        "residual": [each.residual for each in first],
+        "kind": [trace.plan.experiment.robots[name].kind for name in trace.robots],
         "worst": [each.worst for each in first],
-        "phases": [tuple(phase[i] for phase in shared.phases[1:]) for i in rows],
-        "settle_s": settled,
-        "missed_share": list(map(_share, trace.missed_deadlines, trace.ticks + trace.missed_deadlines)),
-        "gap_min_s": [float(waits.min()) if len(waits) else None for waits in shared.waits],
-        "gap_median_s": [float(np.median(waits)) if len(waits) else None for waits in shared.waits],
-        "gap_max_s": [float(waits.max()) if len(waits) else None for waits in shared.waits],
-        "recorded": shared.transmissions[1].tolist(),
-        "coverage": shared.errors.coverage().tolist() if shared.has_errors else nothing,
-        "known": shared.known.tolist(),
-        "collisions": list(map(len, contacts)),
-        "impulse": [max((each.impulse for each in own if each.impulse is not None), default=None) for own in contacts],
-        "overlap": [max((each.overlap for each in own), default=None) for own in contacts],
-        "short": [_distance_to_goal(trace, shared.errors.net, i) for i in rows],
-        "near": clearance.robots,
-        "near_arena": clearance.arena,
-        "interventions": trace.interventions.tolist(),
-        "intervened_share": list(map(_share, trace.interventions, trace.ticks)),
-        "avoided": trace.avoided.tolist(),
-        "avoided_share": list(map(_share, trace.avoided, trace.ticks)),
-        "foreign": [0] * len(rows) if trace.foreign is None else trace.foreign.tolist(),
-        "extra": [{name: column[i] for name, column in extra.items()} for i in rows],
-        "measures": [_law_measures(trace, {name: column[i] for name, column in extra.items()}) for i in rows],
+        "phases": [*zip(*later, strict=True)] or [()] * len(first),
+        "near": shared.clearance.robots,
+        "near_arena": shared.clearance.arena,
+        "shadow": agreement(trace),
     }
-    return tuple(RobotMetrics(**{name: column[i] for name, column in columns.items()}) for i in rows)
+    found = []
+    for row in zip(*columns.values(), strict=True):
+        robot = dict(zip(columns, row, strict=True))
+        extra = {name: robot.pop(name) for name in values if name not in fields}
+        found.append(RobotMetrics(**robot, extra=extra, measures=_law_measures(trace, extra)))
+    return tuple(found)
 
 
 def failures(trace: Trace, known: Sequence[float]) -> tuple[str, ...]:
@@ -307,15 +278,6 @@ def _law_measures(trace: Trace, values: Mapping[str, float | None]) -> dict[str,
         name: LawMeasure(values[f"{OF_LAW}{name}_mean"], values[f"{OF_LAW}{name}_end"], each.unit, each.better)
         for name, each in measures_of(trace).items()
     }
-
-
-def _distance_to_goal(trace: Trace, net: Links, row: int) -> float | None:
-    """Distance of a robot with a plan from its goal at the end [m]; None: no plan, or not known."""
-    timeline = trace.plan.experiment.timeline
-    began = [leg for leg in timeline if leg.robot == trace.robots[row] and leg.at_s < trace.time[-1]]
-    if not began or row in net.receiver:
-        return None
-    return _number(float(norm(trace.goal[-1, row] - trace.position[-1, row])))
 
 
 def _number(value: float) -> float | None:

@@ -1,7 +1,7 @@
 """Metrics: what each is called, how runs are compared by it, and how it is measured; ours, and those from outside.
 
-Console, files, reports, sweeps and searches draw from `known_metrics`. A distribution adds one under
-`[project.entry-points."zenpark.metrics"]`, see docs/metrics.md.
+One of ours is one row of `OURS`; console, files, reports, sweeps and searches draw from `known_metrics`. A distribution
+adds one under `[project.entry-points."zenpark.metrics"]`, see docs/metrics.md.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import statistics
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields
-from functools import cache, partial
+from functools import cache
 from math import isfinite, nan
 from operator import attrgetter
 from pathlib import Path
@@ -83,9 +83,16 @@ class Metric(msgspec.Struct, frozen=True):
         return statistics.fmean(known)
 
 
-def _ours(of: Callable[[Measurement], Array | Index | float], label: str, meaning: str, **facts: object) -> Metric:
-    """A metric of zenpark as an object of a class of its own, with the attributes `facts`."""
-    body = {"of": lambda _self, _trace, shared: of(shared), "label": label, "__doc__": meaning, **facts}
+def _ours(
+    of: Callable[[Measurement], Array | Index | Sequence[Number] | float], label: str, meaning: str, **facts: object
+) -> Metric:
+    """A metric of zenpark as an object of a class of its own, with the attributes `facts`; `of` may give None, too."""
+
+    def measured(_metric: Metric, _trace: Trace, shared: Measurement) -> object:
+        found = of(shared)
+        return np.array(found, dtype=float) if isinstance(found, list) and None in found else found
+
+    body = {"of": measured, "label": label, "__doc__": meaning, **facts}
     made = msgspec.defstruct(label, [], bases=(Metric,), namespace=body, module=__name__, frozen=True)
     return cast(type[Metric], made)()
 
@@ -113,7 +120,7 @@ OURS: Final[Mapping[str, Metric]] = {  # names of the fields of `RobotMetrics`, 
     ),
     "rmse": _ours(lambda m: m.integrals[2], "RMSE", "Root of the mean of e(t)².", unit="m", shown=False, figure=True),
     "acquired_s": _ours(
-        lambda m: np.array(m.acquired, dtype=float), "Acquired",
+        attrgetter("acquired"), "Acquired",
         "From when on the moving mean over one second of the error of each link stays within the tolerance, until the"
         " next phase or the end; 0 if it never left. \"By all\" is when the last follower was there; the mean over"
         " followers is of their own times, and is given only if every follower acquired.",
@@ -156,6 +163,72 @@ OURS: Final[Mapping[str, Metric]] = {  # names of the fields of `RobotMetrics`, 
         unit="m", better="more", **OF_CASE,
     ),
 }  # fmt: skip
+DETAILS: Final[dict[str, Metric]] = {  # fields of `RobotMetrics` without a mean
+    "residual": _ours(
+        lambda m: [each.residual for each in m.phases[0]], "Worst link",
+        "|error| of the worst link, averaged over the last second of the first phase.", unit="m",
+    ),
+    "settle_s": _ours(
+        attrgetter("settled"), "Settled",
+        "When e(t) enters the 2 % band of its largest value for good; the duration of the run if never.", unit="s",
+    ),
+    "missed_share": _ours(
+        lambda m: m.trace.missed_deadlines / (m.trace.ticks + m.trace.missed_deadlines), "Missed",
+        "Missed deadlines over the ticks that were due, made or missed.",
+    ),
+    "gap_min_s": _ours(lambda m: m.gap(np.min), "Shortest gap", "Shortest time between transmissions.", unit="s"),
+    "gap_median_s": _ours(lambda m: m.gap(np.median), "Median gap", "Median time between transmissions.", unit="s"),
+    "gap_max_s": _ours(lambda m: m.gap(np.max), "Longest gap", "Longest time between transmissions.", unit="s"),
+    "recorded": _ours(lambda m: m.transmissions[1], "Recorded", "Poses in the recording."),
+    "receivers": _ours(lambda m: m.architecture["receivers"], "Receivers", "Receivers, the central controller too."),
+    "received": _ours(lambda m: m.architecture["received"], "Received", "Poses received, by all receivers together."),
+    "coverage": _ours(
+        lambda m: m.errors.coverage() if m.has_errors else [None] * len(m.trace.robots), "Known errors",
+        "Known share of a robot's link errors.",
+    ),
+    "known": _ours(attrgetter("known"), "Known", "Share of the run in which the robot's own position is known."),
+    "collisions": _ours(lambda m: list(map(len, m.contacts)), "Collisions", "Contacts with robots, obstacles, walls."),
+    "impulse": _ours(
+        lambda m: [max((c.impulse for c in own if c.impulse is not None), default=None) for own in m.contacts],
+        "Impulse", "Impulse of the hardest contact.", unit="N s",
+    ),
+    "overlap": _ours(
+        lambda m: [max((c.overlap for c in own), default=None) for own in m.contacts], "Overlap",
+        "Depth of the deepest contact.", unit="m",
+    ),
+    "short": _ours(attrgetter("short"), "Short", "Distance from the end of the robot's plan.", unit="m"),
+    "interventions": _ours(
+        attrgetter("trace.interventions"), "Interventions", "Ticks on which safety changed the decision."
+    ),
+    "intervened_share": _ours(
+        lambda m: m.trace.interventions / m.trace.ticks, "Changed by safety",
+        "Share of the ticks on which safety changed the decision.",
+    ),
+    "avoided": _ours(attrgetter("trace.avoided"), "Avoided", "Ticks on which avoidance changed the decision."),
+    "avoided_share": _ours(
+        lambda m: m.trace.avoided / m.trace.ticks, "By avoidance",
+        "Share of the ticks on which avoidance changed the decision.",
+    ),
+    "goals": _ours(lambda m: m.architecture["goals"], "Goals", "Goals that the central controller sent."),
+    "goal_bytes": _ours(
+        lambda m: m.architecture["goal_bytes"], "Payload of goals", "Payload of the goals of a robot.", unit="bytes"
+    ),
+    "delay_mean_s": _ours(
+        lambda m: m.architecture["delay_mean_s"], "Delay, mean",
+        "From the measurement of a pose until the robot acts on the first goal that rests on it.", unit="s",
+    ),
+    "delay_p95_s": _ours(
+        lambda m: m.architecture["delay_p95_s"], "Delay, 95 %", "95 % of the same delays are shorter.", unit="s"
+    ),
+    "delay_max_s": _ours(
+        lambda m: m.architecture["delay_max_s"], "Delay, longest", "The longest of the same delays.", unit="s"
+    ),
+    "foreign": _ours(
+        lambda m: [0] * len(m.trace.robots) if m.trace.foreign is None else m.trace.foreign, "Foreign poses",
+        "Poses in the robot's name that did not come from its process, and were refused.",
+    ),
+}  # fmt: skip
+FIGURES: Final = {**OURS, **DETAILS}  # figures of ours: those of robots are the fields of `RobotMetrics`
 CONSOLE: Final = ("f_hz", "iae", "rmse", "acquired_s")  # those of ours in a line of the terminal
 ERRORS: Final = tuple(name for name, metric in OURS.items() if metric.figure and metric.relative)
 TAKEN: Final = {  # columns of tables
@@ -189,32 +262,27 @@ def swept_metrics(plans: Iterable[Plan] = ()) -> dict[str, Metric]:
 
 def law_metrics(measures: Mapping[str, Measure]) -> dict[str, Metric]:
     """Two metrics of each measure of a law: over the run, with a ratio and a figure, and over the last second."""
-    found = dict[str, Metric]()
-    for name, measure in measures.items():
-        facts: dict[str, Any] = {"unit": measure.unit, "better": measure.better, "applies": partial(_measured, name)}
-        facts |= {"needs": ("true_position", "measures")}
-        judged = bool(measure.better)
-        found[f"{OF_LAW}{name}_mean"] = _ours(
-            partial(_mean_of_measure, name), f"{name} (mean)", f"Measure {name} of the law, mean over the run.",
-            relative=judged, figure=judged, **facts,
-        )  # fmt: skip
-        found[f"{OF_LAW}{name}_end"] = _ours(
-            partial(_end_of_measure, name), f"{name} (end)",
+    return {
+        f"{OF_LAW}{name}_{when}": metric
+        for name, measure in measures.items()
+        for when, metric in zip(("mean", "end"), _of_measure(name, measure), strict=True)
+    }
+
+
+def _of_measure(name: str, measure: Measure) -> tuple[Metric, Metric]:
+    facts: dict[str, Any] = {"unit": measure.unit, "better": measure.better, "needs": ("true_position", "measures")}
+    facts |= {"applies": lambda _metric, trace: name in trace.measures}
+    judged = bool(measure.better)
+    return (
+        _ours(
+            lambda m: mean_known(m.trace.measures[name]), f"{name} (mean)",
+            f"Measure {name} of the law, mean over the run.", relative=judged, figure=judged, **facts,
+        ),
+        _ours(
+            lambda m: mean_known(m.trace.measures[name][-m.window :]), f"{name} (end)",
             f"Measure {name} of the law, mean over the last second.", relative=False, **facts,
-        )  # fmt: skip
-    return found
-
-
-def _measured(name: str, trace: Trace) -> bool:
-    return name in trace.measures
-
-
-def _mean_of_measure(name: str, shared: Measurement) -> Array:
-    return mean_known(shared.trace.measures[name])
-
-
-def _end_of_measure(name: str, shared: Measurement) -> Array:
-    return mean_known(shared.trace.measures[name][-shared.window :])
+        ),
+    )  # fmt: skip
 
 
 def measures_of(trace: Trace) -> dict[str, Measure]:

@@ -82,55 +82,51 @@ class LawMeasure(msgspec.Struct, frozen=True):
 
 
 class RobotMetrics(msgspec.Struct, frozen=True):
-    """Metrics of a robot in a case; unknown numbers are None."""
+    """Metrics of a robot in a case, see `experiments.metrics.metric.FIGURES`; unknown numbers are None."""
 
     robot: str
     kind: str
-    f_hz: float  # [Hz] transmission rate f: poses transmitted in a second
-    messages: int  # transmissions, by the sequence numbers
-    bytes: int  # payload sent
-    # [m·s] ∫ e dt, e = Σ|d − distance| over the links on which it receives (on which it sends, if none)
+    f_hz: float
+    messages: int
+    bytes: int
     iae: float | None
-    itae: float | None  # [m·s²] ∫ t·e dt
-    rmse: float | None  # [m] √(mean e²)
-    # [s] from then on the one-second mean of |error| of each of its links stays within the tolerance until the next
-    # phase; None if never
+    itae: float | None
+    rmse: float | None
     acquired_s: float | None
-    lost: int  # poses that by their numbers were sent and never reached a receiver
-    dropped: int  # number dropped by the modelled network, over all receivers
-    missed_deadlines: int  # ticks that were skipped: their time had passed
-    residual: float | None  # [m] worst link, |error| averaged over the last second of the first phase
+    lost: int
+    dropped: int
+    missed_deadlines: int
+    residual: float | None
     worst: str  # robot at the other end of that link
     phases: tuple[PhaseMetrics, ...]  # each later phase
-    # [s] when e enters the 2 % band of its largest value for good; the duration if never, None without targets of links
     settle_s: float | None
-    missed_share: float | None  # missed deadlines over the ticks that were due, made or missed
-    updates: int  # recomputed goals
-    gap_min_s: float | None  # [s] shortest time between two transmissions
-    gap_median_s: float | None  # [s] median
-    gap_max_s: float | None  # [s] longest
-    recorded: int  # poses in the recording
-    receivers: int  # receivers, with the central controller
-    received: int  # poses of it received, by all receivers together
-    coverage: float | None  # known share of its link errors; None without targets
-    known: float  # share of the run in which its own position is known
-    collisions: int  # contacts with robots, obstacles and walls
-    impulse: float | None  # [N s] impulse of the hardest contact; None if unknown
-    overlap: float | None  # [m] overlap of the deepest contact; None without a contact
-    short: float | None  # [m] distance from the end of its plan; None without a plan
+    missed_share: float | None
+    updates: int
+    gap_min_s: float | None
+    gap_median_s: float | None
+    gap_max_s: float | None
+    recorded: int
+    receivers: int
+    received: int
+    coverage: float | None
+    known: float
+    collisions: int
+    impulse: float | None
+    overlap: float | None
+    short: float | None
     near: Approach | None  # closest approach to another robot
     near_arena: Approach | None  # closest approach to an obstacle or a wall
-    interventions: int  # ticks on which safety changed the decision
-    intervened_share: float | None  # share of the ticks
-    avoided: int  # ticks on which avoidance changed the decision
-    avoided_share: float | None  # share of the ticks
+    interventions: int
+    intervened_share: float | None
+    avoided: int
+    avoided_share: float | None
     shadow: ShadowMetrics | None  # None without a shadow twin
-    goals: int = 0  # sent to it by the central controller
-    goal_bytes: int = 0  # payload of these goals
-    delay_mean_s: float | None = None  # [s] see `CentralisedMetrics`; None for robots that decide for themselves
-    delay_p95_s: float | None = None  # [s]
-    delay_max_s: float | None = None  # [s]
-    foreign: int = 0  # poses in its name that did not come from its process, and were refused
+    goals: int = 0
+    goal_bytes: int = 0
+    delay_mean_s: float | None = None
+    delay_p95_s: float | None = None
+    delay_max_s: float | None = None
+    foreign: int = 0
     extra: dict[str, float | None] = {}  # metrics of other distributions, by name
     measures: dict[str, LawMeasure] = {}  # measures of its law, by name
 

@@ -23,8 +23,9 @@ from experiments.arrays import ArrayTable
 from experiments.definition.formation import counted_links, robot_sums, targeted
 from experiments.definition.graph import Links
 from experiments.definition.plan import Plan
-from experiments.metrics.clearance import Clearance
-from experiments.metrics.results import LinkDelivery, PhaseMetrics
+from experiments.metrics import centralised
+from experiments.metrics.clearance import Clearance, collisions
+from experiments.metrics.results import Collision, LinkDelivery, PhaseMetrics
 from experiments.recording.losses import count_unrecorded
 from experiments.recording.trace import ROUNDING_S, Trace
 from twins.arrays import Array, Index, Mask, norm
@@ -496,11 +497,37 @@ class Measurement:
         return tuple(found)
 
     @_kept
-    def settled(self) -> list[float | None]:
-        """From when on the error of each robot stays in its 2 % band [s]; None if never."""
-        total = self.robot_errors
+    def settled(self) -> Array:
+        """From when on the error of each robot stays in its 2 % band (N,) [s]; the duration if never."""
+        total, time = self.robot_errors, self.trace.time
+        if not self.has_errors:
+            return np.full(total.shape[1], np.nan)
         unsettled = ~(total <= BAND * np.where(np.isfinite(total), total, 0.0).max(axis=0))
-        return after_last(unsettled & (self.errors.there | np.isfinite(total)), self.trace.time)
+        found = after_last(unsettled & (self.errors.there | np.isfinite(total)), time)
+        return np.array([time[-1] - time[0] if when is None else when for when in found])
+
+    @_kept
+    def short(self) -> Array:
+        """Distance of each robot with a plan from its goal at the end (N,) [m]."""
+        trace, net = self.trace, self.errors.net
+        began = {leg.robot for leg in trace.plan.experiment.timeline if leg.at_s < trace.time[-1]}
+        planned = [name in began and row not in net.receiver for row, name in enumerate(trace.robots)]
+        return np.where(planned, norm(trace.goal[-1] - trace.position[-1]), np.nan)
+
+    @_kept
+    def collisions(self) -> tuple[Collision, ...]:
+        """Contacts in order of time."""
+        return collisions(self.trace, self.clearance)
+
+    @_kept
+    def contacts(self) -> list[list[Collision]]:
+        """Contacts of each robot."""
+        return [[each for each in self.collisions if name in {each.first, each.second}] for name in self.trace.robots]
+
+    @_kept
+    def architecture(self) -> dict[str, list[Any]]:
+        """Receivers, deliveries and goals of each robot, see `centralised.columns`."""
+        return centralised.columns(self.trace, self.errors.net)
 
     @_kept
     def transmissions(self) -> tuple[Index, Index]:
@@ -525,6 +552,10 @@ class Measurement:
     def waits(self) -> list[Array]:
         """Times between the transmissions of each robot [s]."""
         return [np.diff(np.sort(self.trace.sent_by(i).stamp)) for i in range(len(self.trace.robots))]
+
+    def gap(self, statistic: Callable[[Array], Any]) -> list[float | None]:
+        """A statistic of these times of each robot [s]; None for fewer than two transmissions."""
+        return [float(statistic(each)) if len(each) else None for each in self.waits]
 
     @_kept
     def payload(self) -> Index:

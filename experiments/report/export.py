@@ -13,14 +13,13 @@ from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from subprocess import CalledProcessError
-from types import NoneType
-from typing import Any, Final, get_args, get_type_hints
+from typing import Any, Final
 
 import numpy as np
 
 from agents.errors import ExplainedError
 from experiments.definition.graph import adjacency
-from experiments.metrics.metric import PLAIN, known_metrics
+from experiments.metrics.metric import FIGURES, PLAIN, known_metrics
 from experiments.metrics.results import CaseMetrics, RobotMetrics
 from experiments.metrics.signals import Measurement, phase_starts
 from experiments.recording.trace import Trace
@@ -54,14 +53,6 @@ UNITS: Final[dict[str, Any]] = {
         "bearing": "1, from the sender to the receiver",
     },
     "metrics": {
-        "residual": "m",
-        "settle_s": "s",
-        "gap_min_s": "s",
-        "gap_median_s": "s",
-        "gap_max_s": "s",
-        "impulse": "N s",
-        "overlap": "m",
-        "short": "m",
         "formation_acquired_s": "s, for each phase",
         "rotation_rad_s": "rad/s, for each phase",
     },
@@ -145,10 +136,10 @@ def structure(trace: Trace, metrics: CaseMetrics) -> dict[str, Any]:
     net, sent = trace.plan.links, trace.sent
     experiment = trace.plan.experiment
     arrays = ("time", "position", "yaw", "true_position", "goal", "setpoint")
-    kinds = get_type_hints(RobotMetrics).items()
-    columns = [name for name, kind in kinds if set(get_args(kind) or (kind,)) <= {int, float, NoneType}]
+    columns = [name for name in RobotMetrics.__struct_fields__ if name in FIGURES]
     columns += [name for robot in metrics.robots[:1] for name in robot.extra]
-    measured = {name: metric.unit.translate(PLAIN) for name, metric in known_metrics().items() if metric.unit}
+    figures = FIGURES | known_metrics()
+    measured = {name: each.unit.translate(PLAIN) for name, each in figures.items() if each.unit}
     links = {
         "receiver": net.receiver + 1,  # MATLAB counts from 1
         "sender": net.sender + 1,

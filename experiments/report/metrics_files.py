@@ -59,28 +59,29 @@ def write_csv(path: Path, cases: Sequence[CaseMetrics]) -> None:
         table.writeheader()
         for case in cases:
             table.writerows(_robot_rows(case))
-            known = {"seed": case.seed, "case": case.case, "spoiled": int(bool(case.spoiled))}
-            table.writerow({**known, "robot": "mean", **case.mean})
+            table.writerow({**_of_case(case), "robot": "mean", **case.mean})
 
 
 def rows(cases: Sequence[CaseMetrics]) -> Iterator[dict[str, object]]:
     """A row per case and robot with all columns of `metrics.csv`; None where a value is unknown."""
-    columns = _columns(cases)
-    for case in cases:
-        for row in _robot_rows(case):
-            yield {column: row.get(column) for column in columns}
+    columns = dict.fromkeys(_columns(cases))
+    return (columns | row for case in cases for row in _robot_rows(case))
 
 
 def _columns(cases: Sequence[CaseMetrics]) -> list[str]:
     later = max((len(case.starts_s) for case in cases), default=1)
-    near = [f"{what}_{part}" for what in ("near", "near_arena") for part in ("gap", "to", "at_s")]
-    shadows = list(_flat_shadow(None)) if any(robot.shadow for case in cases for robot in case.robots) else []
     phases = [f"phase{k}_{what}" for k in range(2, later + 1) for what in ("acquired_s", "residual", "worst")]
+    near = [f"{what}_{part}" for what in ("near", "near_arena") for part in ("gap", "to", "at_s")]
+    shadow = next((robot.shadow for case in cases for robot in case.robots if robot.shadow), None)
     added = dict.fromkeys(name for case in cases for name in case.mean if name not in _PLAIN)
-    return ["seed", "case", "spoiled", "in_mean", *_PLAIN, *phases, *near, *shadows, *added]
+    return ["seed", "case", "spoiled", "in_mean", *_PLAIN, *phases, *near, *_flat_shadow(shadow), *added]
 
 
 _PLAIN: Final = [field for field in RobotMetrics.__struct_fields__ if field not in _NESTED]
+
+
+def _of_case(case: CaseMetrics) -> dict[str, object]:
+    return {"seed": case.seed, "case": case.case, "spoiled": int(bool(case.spoiled))}
 
 
 def _robot_rows(case: CaseMetrics) -> Iterator[dict[str, object]]:
@@ -92,21 +93,16 @@ def _robot_rows(case: CaseMetrics) -> Iterator[dict[str, object]]:
         for what, near in (("near", robot.near), ("near_arena", robot.near_arena)):
             if near is not None:
                 row |= {f"{what}_gap": near.gap, f"{what}_to": near.between[1], f"{what}_at_s": near.at_s}
-        row |= _flat_shadow(robot.shadow) if robot.shadow else {}
-        row |= robot.extra
-        known = {"seed": case.seed, "case": case.case, "spoiled": int(bool(case.spoiled))}
-        yield {**known, "in_mean": int(robot.robot not in out), **row}
+        in_mean = int(robot.robot not in out)
+        yield {**_of_case(case), "in_mean": in_mean, **row, **_flat_shadow(robot.shadow), **robot.extra}
 
 
 def _flat_shadow(shadow: ShadowMetrics | None) -> dict[str, object]:
     """Fields of a shadow twin as columns; those along three axes as three."""
     flat: dict[str, object] = {}
-    for field in ShadowMetrics.__struct_fields__:
-        value = None if shadow is None else getattr(shadow, field)
-        if field in {"bias", "correlation"}:
-            flat |= {f"shadow_{field}_{axis}": part for axis, part in zip("xyz", value or (None,) * 3, strict=True)}
-        else:
-            flat[f"shadow_{field}"] = value
+    for field, value in ({} if shadow is None else msgspec.structs.asdict(shadow)).items():
+        parts = zip("xyz", value, strict=True) if isinstance(value, tuple) else [("", value)]
+        flat |= {f"shadow_{field}_{axis}".rstrip("_"): part for axis, part in parts}
     return flat
 
 

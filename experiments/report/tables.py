@@ -143,12 +143,8 @@ def whole_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
 
     def phased(field: str, scale: float) -> list[Line]:
         """A line for each phase."""
-
-        def value(case: CaseMetrics, k: int) -> float | None:
-            values = getattr(case, field)
-            return values[k] if k < len(values) else None
-
-        return [(_phase(cases, k).strip() or "from the start", partial(value, k=k), scale) for k in phases]
+        of_phase = [lambda case, k=k: next(iter(getattr(case, field)[k:]), None) for k in phases]
+        return [(_phase(cases, k).strip() or "from the start", value, scale) for k, value in enumerate(of_phase)]
 
     units: dict[str, list[Line]] = {
         "Acquired by all followers [s]": phased("acquired_s", 1.0),
@@ -385,24 +381,21 @@ def mean_delay(links: Sequence[LinkDelivery]) -> float | None:
 def clearance_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
     """Closest approaches of each robot and its changed ticks, per case; over seeds the nearest and the mean."""
 
-    def gap(near: Approach) -> Cell:
-        return number(near.gap, 100.0), near.between[1]
+    def nearest(robots: Sequence[RobotMetrics], field: str) -> Approach | None:
+        known = [near for near in map(attrgetter(field), robots) if near is not None]
+        return min(known, key=attrgetter("gap"), default=None)
 
-    def at(near: Approach) -> str:
-        return f"{near.at_s:.2f}"
+    def gap(robots: Sequence[RobotMetrics], field: str) -> Cell:
+        return NONE if (near := nearest(robots, field)) is None else (number(near.gap, 100.0), near.between[1])
 
-    def nearest(show: Callable[[Approach], Cell], field: str) -> Callable[[Sequence[RobotMetrics]], Cell]:
-        def cell(robots: Sequence[RobotMetrics]) -> Cell:
-            known = [near for near in map(attrgetter(field), robots) if near is not None]
-            return show(min(known, key=attrgetter("gap"))) if known else NONE
+    def at(robots: Sequence[RobotMetrics], field: str) -> Cell:
+        return NONE if (near := nearest(robots, field)) is None else f"{near.at_s:.2f}"
 
-        return cell
-
-    columns = [
-        ("To a robot [cm]", nearest(gap, "near")),
-        ("t [s]", nearest(at, "near")),
-        ("To the arena [cm]", nearest(gap, "near_arena")),
-        ("t [s]", nearest(at, "near_arena")),
+    columns: list[Column] = [
+        ("To a robot [cm]", partial(gap, field="near")),
+        ("t [s]", partial(at, field="near")),
+        ("To the arena [cm]", partial(gap, field="near_arena")),
+        ("t [s]", partial(at, field="near_arena")),
         ("Collisions", _cell(sum, "collisions")),
         ("Changed by safety [%]", _cell(statistics.fmean, "intervened_share", 100.0)),
         ("By avoidance [%]", _cell(statistics.fmean, "avoided_share", 100.0)),

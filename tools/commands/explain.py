@@ -32,15 +32,14 @@ def explain(
     """Explain a key of the experiment file, a plug-in, a kind of robot or a metric: text, unit, limits, an example."""
     from agents.plugins import files
     from experiments.file import json_schema, reference
-    from experiments.metrics.metric import known_metrics, short_name
-    from experiments.metrics.results import RobotMetrics
+    from experiments.metrics.metric import FIGURES, known_metrics, short_name
 
     warn(json_schema.unusable())
     if schema:
         print_json(json_schema.schema())
         return 0
     found = reference.matching(key) if key else reference.tables()
-    metric = {short_name(name): each for name, each in known_metrics().items()}.get(short_name(key.lower()))
+    metric = {short_name(name): each for name, each in (FIGURES | known_metrics()).items()}.get(short_name(key.lower()))
     if not found and metric is not None:
         print_result(
             {"label": metric.label, "unit": metric.unit, "meaning": metric.meaning},
@@ -57,9 +56,7 @@ def explain(
         hint = f"`./zenpark explain{f' {table}' if reference.matching(table) else ''}` lists what there is"
         if (near := did_you_mean(key, words)).startswith("did you mean"):
             hint = near
-        if key.lower() in {
-            field for metric in RobotMetrics.__struct_fields__ for field in (metric, metric.split("_")[0])
-        }:
+        if key.lower() in {name.split("_")[0] for name in FIGURES}:
             hint, listed = "a metric of a run: `./zenpark docs`, page 'Metrics and CSV columns'", []
         if files.is_choice(key):
             hint, listed = "classes in files are not explained: their parameters stand in the file", []

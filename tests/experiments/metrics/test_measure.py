@@ -3,6 +3,7 @@
 import csv
 import math
 from dataclasses import replace
+from typing import get_args, get_type_hints
 
 import msgspec
 import numpy as np
@@ -10,13 +11,16 @@ import pytest
 
 from agents.network.messages import Event
 from experiments.definition.experiment import AnchorTable, Shadow
-from experiments.metrics import statistics
+from experiments.metrics import metric, statistics
 from experiments.metrics.measure import measure
-from experiments.metrics.metric import OURS
+from experiments.metrics.metric import FIGURES, OURS
+from experiments.metrics.results import RobotMetrics
 from experiments.metrics.shadow import agreement
 from experiments.metrics.signals import Measurement, belief_errors, net_rotation
-from experiments.report import figures, metrics_files, verdict
+from experiments.report import export, figures, metrics_files, report, tables, typeset, verdict
+from experiments.sweep import table
 from tests.experiments.traces import STEP, at_origin, cut, pair, park, trace
+from tools.commands.explain import explain
 
 T = np.arange(0.0, 20.0 + STEP / 2, STEP)
 DECAY = pair(1.0 + np.exp(-T))
@@ -28,6 +32,36 @@ def unseen(known, *holes):
     for begin, end, *row in holes:
         place[(known.time > begin) & (known.time < end), row[0] if row else slice(None)] = np.nan
     return replace(known, true_position=place)
+
+
+def test_numbers_of_robots_are_rows_of_figures():
+    kinds = {name: {*get_args(kind), kind} for name, kind in get_type_hints(RobotMetrics).items()}
+    numbers = {name for name, kind in kinds.items() if kind & {int, float} and not kind & {dict[str, float | None]}}
+    assert numbers == {name for name, metric in FIGURES.items() if metric.per == "robot"}
+    assert all(metric.label and metric.meaning.endswith(".") for metric in FIGURES.values())
+    assert len({metric.head for metric in FIGURES.values()}) == len(FIGURES)
+
+
+def test_a_new_figure_is_one_row(tmp_path, monkeypatch, capsys):
+    row = metric._ours(lambda m: m.trace.ticks * 2.0, "Twice", "Twice the ticks.", unit="s²", figure=True)
+    monkeypatch.setattr(metric, "OURS", {**OURS, "twice": row})
+    before, after = pair(1.0 + np.exp(-T)), pair(2.0 + np.exp(-T))
+    cases = [measure(replace(before, case="a")), measure(replace(after, case="b"))]
+    twice = 2.0 * float(before.ticks[1])
+    assert (cases[0].robots[1].value("twice"), cases[0].mean["twice"]) == (twice, twice)
+    metrics_files.write_csv(tmp_path / "metrics.csv", cases)
+    with (tmp_path / "metrics.csv").open() as file:
+        assert [float(line["twice"]) for line in csv.DictReader(file)][1:3] == [twice, twice]
+    document = metrics_files.document("", 1, cases)
+    assert document["cases"]["b"]["ratio"]["twice"] == 1.0
+    struct = export.structure(before, cases[0])
+    assert (struct["metrics"]["twice"].tolist()[1], struct["units"]["metrics"]["twice"]) == (twice, "s^2")
+    listed = typeset.latex(report.result_tables(cases))
+    assert "Twice [s$^2$]" in listed
+    assert "twice" in table.relative_metrics()
+    assert ("Twice", "Twice the ticks.") in tables.definitions(cases)
+    assert explain("twice") == 0
+    assert "metric: Twice [s²]" in capsys.readouterr().out
 
 
 def test_integrals_of_a_decaying_error():
