@@ -68,6 +68,7 @@ class Look:
     sent: dict[tuple[int, str], int] = field(default_factory=dict)  # poses, by process and robot
     phases: dict[tuple[int, str], int] = field(default_factory=dict)
     links: dict[tuple[Process | None, bool], bool] = field(default_factory=dict)  # answers of `linked` at this look
+    tokens: dict[str, list[Process]] = field(default_factory=dict)  # who has declared them, at this look
     ran_s: dict[str, float] = field(default_factory=dict)  # time in the experiment, by robot
     held_s: dict[str, float] = field(default_factory=dict)  # time for which it stood then
 
@@ -122,6 +123,14 @@ class Look:
         if (found := self.links.get((process, slowly))) is None:
             found = self.links[process, slowly] = self._link(process, slowly=slowly)
         return found
+
+    def owners(self, token: str) -> list[Process]:
+        """Living processes that have declared a token, whether the run has started them or somebody by hand."""
+        if not self.tokens:
+            for process in self.world.processes:
+                for each in self.world.tokens(process):
+                    self.tokens.setdefault(each, []).append(process)
+        return self.tokens.get(token, [])
 
     def _link(self, process: Process | None, *, slowly: bool) -> bool:
         if process is None or process.dead or process.paused:

@@ -182,10 +182,9 @@ def knowledge_of_tokens(look: Look, seen: Seen) -> str:
         if not knows:
             look.since.pop(("token", seen.name, sender.name), None)
             continue
-        other = look.world.robots.get(sender.name)
-        tokens = (token.key for session in look.world.sessions(sender.name) for token in session.tokens)
-        there = sender._token in tokens
-        differs = other is not None and (other.dead or look.linked(other)) and bool(sender.alive) != there
+        own, owners = look.world.robots.get(sender.name), look.owners(sender._token)
+        heard = own is not None and (own.dead or look.linked(own)) and all(map(look.linked, owners))
+        differs = heard and bool(sender.alive) != bool(owners)
         if lasted := look.lasting(("token", seen.name, sender.name), differs, 3.0):
             return f"believes that {sender.name} is {'alive' if sender.alive else 'gone'} for {lasted:.1f} s"
     return ""
@@ -204,10 +203,10 @@ def knowledge_of_poses(look: Look, seen: Seen) -> str:
         if not knows:
             look.since.pop(("pose", seen.name, sender.name), None)
             continue
-        other = look.world.robots.get(sender.name)
-        theirs = None if other is None else look.world.runtimes.get(other.pid)
+        owners = look.owners(sender._token)
+        theirs = look.world.runtimes.get(owners[0].pid) if len(owners) == 1 and look.linked(owners[0]) else None
         deaf = False
-        if theirs is not None and theirs._joined and look.linked(other) and not sender.doubt:
+        if theirs is not None and theirs._joined and not sender.doubt:
             row = theirs._names.index(sender.name)
             both = seen.phase in (AIRBORNE, RUNNING) and theirs.robots[row].lifecycle.phase in (AIRBORNE, RUNNING)
             deaf = both and sender._order.seq < theirs.counts.sent[row] - 2
@@ -317,6 +316,7 @@ class Rules:
     def _check(self) -> None:
         look = self._look
         look.links.clear()
+        look.tokens.clear()
         seen = [*look.seen()]
         self.robot_s += LOOK_S * len(seen)
         for one in seen:

@@ -129,6 +129,16 @@ def test_second_process_ends_without_a_command():
     assert (flight.code, flight.robots["A"].hazards) == (0, [])
 
 
+def test_second_process_takes_a_free_name():
+    """Others know that the name is alive, though the process that the run has started is not."""
+    twice, kill = Fault(0.4, "twice", "C", since="launch"), Fault(0.3, "kill", "C", since="ready")
+    settings = ["duration_s=9", 'start.missing="go-on"', "start.deadline_s=3"]
+    flight = fly(TRIO, twice, kill, settings=settings)
+    (second,) = flight.of("second C")
+    assert [each.phase for each in flight.robots["C"].phases if each.pid == second.pid][:2] == ["idle", "ready"]
+    assert (flight.code, second.code, flight.violations) == (1, 0, [])
+
+
 def test_former_owner_commands_nothing():
     back = 3.5
     flight = fly(TRIO, Fault(0.5, "cut", "A", lasts=back - 0.5), Fault(1.9, "twice", "A"), settings=["duration_s=7"])

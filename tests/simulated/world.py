@@ -177,13 +177,19 @@ class World:
         return None if found is None or found.dead else found
 
     def sessions(self, who: str) -> list[net.Session]:
-        process = self.process(who)
-        return [] if process is None else [each for each in process.sessions if isinstance(each, net.Session)]
+        return self._sessions(self.process(who))
+
+    def tokens(self, process: sim.Process) -> list[str]:
+        """Keys of the tokens that a process has declared; none if it is dead."""
+        return [token.key for session in self._sessions(process) for token in session.tokens]
+
+    def _sessions(self, process: sim.Process | None) -> list[net.Session]:
+        there = [] if process is None or process.dead else process.sessions
+        return [each for each in there if isinstance(each, net.Session)]
 
     def session(self, process: sim.Process) -> net.Session | None:
         """The newest open session of a living process."""
-        opened = (each for each in reversed(process.sessions) if isinstance(each, net.Session) and not each.closed)
-        return None if process.dead else next(opened, None)
+        return next((each for each in reversed(self._sessions(process)) if not each.closed), None)
 
     def signal(self, process: sim.Process, number: int) -> None:
         """Send a signal; what its handler raises is raised in the main thread."""
