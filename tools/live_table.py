@@ -8,15 +8,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from enum import IntEnum
+from dataclasses import dataclass, field, replace
 from itertools import accumulate
 from math import inf
 from textwrap import wrap
 from typing import TYPE_CHECKING, Final
 
 from agents.network.messages import Event, Status
-from experiments.real_time.conductor.run_view import FROZEN_S
+from experiments.scene.condition import Condition, RobotRow, robot_row
 from tools.terminal import printable
 
 if TYPE_CHECKING:
@@ -33,41 +32,10 @@ NOTE: Final = 10  # least width of the last column
 BAR: Final = 20
 
 
-class Rank(IntEnum):
-    """Needs of a robot, the most urgent first."""
-
-    GONE = 0  # lost, dead, or stopped by an emergency stop
-    TOUCHING = 1  # overlaps another robot, an obstacle or a wall
-    SILENT = 2
-    HELD = 3  # a hazard is present
-    LOW = 4  # battery
-    LATE = 5  # ticks were skipped in the last seconds
-    LOST = 6  # samples were lost in the last seconds
-    FINE = 7
-
-
 COLOURS: Final = {
-    Rank.GONE: "bold red", Rank.TOUCHING: "bold red", Rank.SILENT: "magenta", Rank.HELD: "yellow",
+    Condition.LOST: "bold red", Condition.STOPPED: "bold red", Condition.TOUCHING: "bold red",
+    Condition.OUT: "yellow", Condition.SILENT: "magenta", Condition.HELD: "yellow",
 }  # fmt: skip
-
-
-@dataclass(frozen=True)
-class LiveRow:
-    """One robot; None where nothing is known."""
-
-    name: str
-    phase: str
-    rank: Rank = Rank.FINE
-    error: float | None = None  # [m]
-    rate: float = 0.0  # [Hz] rate of transmitted poses
-    late: int | None = None  # ticks that were skipped
-    lost: int | None = None  # samples of neighbours
-    cpu: float | None = None  # share of a core; of its process, if several robots share one
-    battery: float | None = None  # 0 to 1
-    sent: int | None = None  # poses
-    note: str = ""
-    growing: frozenset[str] = frozenset()  # counters "late" and "lost" that grew in the last seconds
-    pid: int = 0
 
 
 @dataclass
@@ -106,74 +74,44 @@ class Trends:
         return known
 
     def row(
-        self, name: str, status: Status | None, *, now: float, error: float | None, gone: str = "", lost: bool = False,
-        touches: str = "",
-    ) -> LiveRow:  # fmt: skip
-        """The row of a robot.
-
-        Args:
-            now: [s, UTC], by the clock of the statuses' stamps.
-            error: [m]
-            gone: Why the run goes on without it; empty while it takes part.
-            lost: It should take part: process or token have vanished.
-            touches: Its contacts in words, if any.
-        """
+        self, name: str, condition: Condition, status: Status | None, error: float | None, *, now: float,
+        left: str = "", touches: str = "",
+    ) -> RobotRow:  # fmt: skip
+        """The row of a robot as `robot_row` makes it, at `now` [s, UTC] by the clock of the statuses' stamps."""
+        row = robot_row(name, condition, status, error, left=left, touches=touches)
         if status is None:
-            return LiveRow(name, gone or "starting", Rank.GONE if lost else Rank.FINE)
+            return row
         trend = self.add(status)
         growing = frozenset(word for word, when in trend.grew.items() if now - when < RECENT_S)
-        phase, rank = gone or status.phase, Rank.FINE
-        if lost:
-            rank = Rank.GONE
-        elif touches:
-            phase, rank = "touches", Rank.TOUCHING
-        elif not gone and now - status.stamp > FROZEN_S:
-            phase, rank = "silent", Rank.SILENT
-        elif not gone:
-            rank = _rank(status, growing)
-            phase = "held" if status.hazard.startswith("hold") else phase
-        note = (
-            touches
-            or status.hazard
-            or status.reason
-            or ("misses " + ", ".join(status.missing) if status.missing else "")
-        )
-        if status.malformed:
-            note += f" {status.malformed} malformed"
-        if foreign := sum(status.foreign.values()):
-            note += f" {foreign} foreign"
-        return LiveRow(
-            name, phase, rank, error, trend.rate, status.missed, sum(status.lost.values()), trend.cpu, status.battery,
-            status.sent, note.strip(), growing, status.pid,
-        )  # fmt: skip
+        return replace(row, rate=trend.rate, cpu=trend.cpu, growing=growing)
 
 
-def _rank(status: Status, growing: frozenset[str]) -> Rank:
-    for rank, applies in (
-        (Rank.HELD, bool(status.hazard)),
-        (Rank.LOW, status.battery is not None and status.battery < LOW_BATTERY),
-        (Rank.LATE, "late" in growing),
-        (Rank.LOST, "lost" in growing),
-    ):
-        if applies:
-            return rank
-    return Rank.FINE
+def needs(row: RobotRow) -> tuple[int, ...]:
+    """Needs of a robot, the gravest first; the larger, the more urgent, and zeros without any."""
+    low = row.battery is not None and row.battery < LOW_BATTERY
+    if row.condition == Condition.ABSENT:
+        return (0,) * 5
+    grave = row.condition if row.condition >= Condition.HELD else 0
+    return int(grave), int(row.warned), int(low), int("late" in row.growing), int("lost" in row.growing)
 
 
-def worst_first(rows: Sequence[LiveRow], *, fit: bool) -> list[LiveRow]:
+def worst_first(rows: Sequence[RobotRow], *, fit: bool) -> list[RobotRow]:
     """Rows by urgency; rows of one urgency by error where not all fit, else as they came: a table that stays still."""
-    return sorted(rows, key=lambda row: (row.rank, 0.0 if fit else -(row.error if row.error is not None else -inf)))
+    return sorted(
+        rows, key=lambda row: (needs(row), 0.0 if fit else -inf if row.error is None else row.error), reverse=True
+    )
 
 
-def totals(rows: Sequence[LiveRow], shown: int) -> LiveRow:
+def totals(rows: Sequence[RobotRow], shown: int) -> RobotRow:
     """One row for all: the largest error, the lowest battery, sums of the rest, each process counted once."""
     cpu = {row.pid or row.name: row.cpu for row in rows if row.cpu is not None}
-    notable = sum(row.rank < Rank.FINE for row in rows)
-    return LiveRow(
+    notable = sum(any(needs(row)) for row in rows)
+    return RobotRow(
         f"all {len(rows)}",
+        Condition.ACTIVE,
         f"+{len(rows) - shown} more",
         error=max((row.error for row in rows if row.error is not None), default=None),
-        rate=sum(row.rate for row in rows),
+        rate=sum(row.rate or 0.0 for row in rows),
         late=sum(row.late or 0 for row in rows),
         lost=sum(row.lost or 0 for row in rows),
         cpu=sum(cpu.values()) if cpu else None,
@@ -193,11 +131,11 @@ def metres(error: float | None) -> str:
     return "–" if error is None else f"{error:.3f}"
 
 
-def _cells(row: LiveRow) -> list[Text]:
+def _cells(row: RobotRow) -> list[Text]:
     """Texts of a row, by column."""
     from rich.text import Text
 
-    colour = COLOURS.get(row.rank, "")
+    colour = COLOURS.get(row.condition, "yellow" if needs(row)[1] else "")
     counts = [("", "") if value is None else (str(value), "yellow" if word in row.growing else "")
               for word, value in (("late", row.late), ("lost", row.lost))]  # fmt: skip
     charge = ""
@@ -207,7 +145,7 @@ def _cells(row: LiveRow) -> list[Text]:
         (printable(row.name), colour),
         (printable(row.phase), colour),
         (metres(row.error), ""),
-        (f"{row.rate:.1f}", ""),
+        (f"{row.rate or 0.0:.1f}", ""),
         *counts,
         ("" if row.cpu is None else f"{100 * row.cpu:.0f} %", ""),
         ("" if row.battery is None else f"{100 * row.battery:.0f} %", charge),
@@ -217,7 +155,7 @@ def _cells(row: LiveRow) -> list[Text]:
     return [Text(text, style) for text, style in cells]
 
 
-def drawn(title: str, rows: Sequence[LiveRow], events: Sequence[Event], width: int, height: int) -> Group:
+def drawn(title: str, rows: Sequence[RobotRow], events: Sequence[Event], width: int, height: int) -> Group:
     """Table of robots, in the order of the experiment, with a title, cut notes, and as many last events as have room.
 
     `width` [characters] and `height` [lines] are limits of all of it.

@@ -7,8 +7,8 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final, Self
 
-from experiments.real_time.conductor.run_view import OUTPUT, EventFeed, Progress, ProgressDisplay, RobotView
-from tools.live_table import LiveRow, Trends, drawn, heading, metres
+from experiments.real_time.conductor.run_view import OUTPUT, EventFeed, Progress, ProgressDisplay
+from tools.live_table import Trends, drawn, heading, metres
 from tools.terminal import printable, say
 
 if TYPE_CHECKING:
@@ -94,14 +94,12 @@ def _table(progress: Progress, trends: Trends, console: Console) -> Group:
     silence = _silence(progress) and f"; {_silence(progress)}"
     title = heading(f"{progress.case}: {progress.phase}{silence}", progress.elapsed, progress.duration)
     now = progress.clock.utc()
-    rows = [_row(trends, name, view, now) for name, view in progress.robots.items()]
+    rows = [
+        trends.row(name, view.condition(now), view.status, view.error, now=now, left=view.left_because)
+        for name, view in progress.robots.items()
+    ]
     news = [event for event in progress.events if event.kind not in (*QUIET, OUTPUT)]
     return drawn(title, rows, news, console.width, console.height - 1)
-
-
-def _row(trends: Trends, name: str, view: RobotView, now: float) -> LiveRow:
-    because = view.left_because
-    return trends.row(name, view.status, now=now, error=view.error, gone=because, lost=because == "lost")
 
 
 def _silence(progress: Progress) -> str:

@@ -14,7 +14,8 @@ import numpy as np
 from agents.network.messages import Ranges
 from experiments.scene import models
 from experiments.scene import stage as appearance
-from experiments.scene.stage import NOWHERE, Colour, Colours, Moment, SceneModel, chassis
+from experiments.scene.condition import RINGED, Colour
+from experiments.scene.stage import NOWHERE, Colours, Moment, SceneModel, chassis
 from twins.arrays import Array, Index, Mask
 
 if TYPE_CHECKING:
@@ -297,7 +298,7 @@ class SceneDrawing:
         if not self._few:
             leading = np.isin(np.array(self.stage.names), self.stage.leaders)
             worst = np.argsort(appearance.sums_of_errors(self.stage, moment.error))[-WORST:]
-            notable = np.isin(moment.condition, appearance.RINGED) | leading
+            notable = np.isin(moment.condition, RINGED) | leading
             notable[worst] = True
             wanted &= notable & (np.cumsum(wanted & notable) <= LABELS)
         for row in [row for row in self._labels if not wanted[row]]:

@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.body.kinds import Kind
-from agents.decision.lifecycle import FINISHED, TOLD_TO_END, Phase
 from agents.kinds.theory import POINT
-from agents.network.messages import EMERGENCY, Ranges, State, Status, WorldState
+from agents.network.messages import Ranges, State, Status, WorldState
 from agents.plugins import registry
 from experiments.arrays import known_rows
 from experiments.definition.experiment import WORLD
@@ -28,16 +27,15 @@ from experiments.definition.formation import errors_over_time, targeted
 from experiments.definition.graph import Links, links
 from experiments.definition.plan import Plan, finds_contacts
 from experiments.metrics.clearance import Overlap, present_overlaps
+from experiments.scene.condition import CONDITIONS, PALED, RINGED, Colour, Condition
 from twins.arrays import Array, Index, Mask, norm
 from twins.scene import Scene
 
 Colours = NDArray[np.uint8]
-Colour = tuple[int, int, int]
 
 BARE: Final = inf  # stands for the error of a link that is there and has no target: it is drawn grey
 GOOD_M: Final = 0.025  # error of a link that counts as kept
 FAIR_M: Final = 0.05
-SILENT_S: Final = 3.0  # time without a status after which a robot counts as silent
 WAY_POINTS: Final = 40  # points of a straight way at which it is looked for bodies
 TOUCH_S: Final = 1.0  # time for which a contact is shown after its end, or after a world has reported it
 FLASH_S: Final = 0.12  # time for which a link is lit after its sender transmits
@@ -69,69 +67,6 @@ PLACES: Final = {BodyLocation.TWIN: "own twin", BodyLocation.WORLD: "in the worl
 CHASSIS: Final[dict[BodyLocation, Colour]] = {
     BodyLocation.TWIN: (236, 236, 232), BodyLocation.WORLD: (128, 132, 140), BodyLocation.REAL: (38, 40, 44),
 }  # fmt: skip
-
-
-class Condition(IntEnum):
-    """Condition of a robot, as it is shown; the numbers grow with what needs attention."""
-
-    ACTIVE = 0
-    WAITING = 1  # not airborne yet
-    DONE = 2
-    LANDING = 3
-    HELD = 4
-    OUT = 5  # landed before the end of its plan
-    SILENT = 6  # its last status is old
-    TOUCHING = 7  # overlaps another robot, an obstacle or a wall
-    STOPPED = 8  # stopped by an emergency stop
-    DEAD = 9  # its liveliness token is gone
-
-
-CONDITIONS: Final[dict[Condition, tuple[str, Colour]]] = {
-    Condition.ACTIVE: ("", (0, 158, 115)),
-    Condition.WAITING: ("waits", (150, 150, 150)),
-    Condition.DONE: ("done", (120, 140, 170)),
-    Condition.LANDING: ("landing", (86, 180, 233)),
-    Condition.HELD: ("held", (230, 159, 0)),
-    Condition.OUT: ("out of the run", (213, 94, 0)),
-    Condition.SILENT: ("silent", (160, 110, 200)),
-    Condition.TOUCHING: ("touches", (213, 50, 30)),
-    Condition.STOPPED: ("stopped", (213, 50, 30)),
-    Condition.DEAD: ("dead", (213, 50, 30)),
-}
-RINGED: Final = (Condition.LANDING, *(each for each in Condition if each >= Condition.HELD))
-AT_REST: Final = (Condition.WAITING, Condition.DONE, Condition.OUT)  # their goals are not drawn
-PALED: Final = (Condition.OUT, Condition.SILENT, Condition.STOPPED, Condition.DEAD)
-IN_TIME: Final = (FINISHED, TOLD_TO_END, "")  # reasons of a robot that has done all of its plan
-
-
-def condition(
-    status: Status | None, phase: str | None = None, *, alive: bool = True, silent: bool = False, touches: bool = False
-) -> Condition:
-    """Condition of a robot.
-
-    Args:
-        status: Last received, if any.
-        phase: Word of its phase; None: that of the status.
-        alive: Its liveliness token stands.
-        silent: Its last message is old.
-        touches: It overlaps another robot, an obstacle or a wall.
-    """
-    phase = status.phase if phase is None and status is not None else phase
-    done, reason = phase == Phase.DONE.word, "" if status is None else status.reason
-    for case, applies in (
-        (Condition.STOPPED, reason.startswith(EMERGENCY)),
-        (Condition.DEAD, not (alive or done)),
-        (Condition.TOUCHING, touches),
-        (Condition.OUT, done and reason not in IN_TIME),
-        (Condition.DONE, done),
-        (Condition.SILENT, silent),
-        (Condition.LANDING, phase == Phase.LANDING.word),
-        (Condition.WAITING, phase in (None, Phase.IDLE.word, Phase.READY.word)),
-        (Condition.HELD, status is not None and status.hazard.startswith("hold")),
-    ):
-        if applies:
-            return case
-    return Condition.ACTIVE
 
 
 def place_of(body: str) -> BodyLocation:

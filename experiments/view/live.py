@@ -18,12 +18,13 @@ import zenoh
 
 from agents.network.keys import Keys
 from agents.network.session import connected
+from experiments.scene.condition import Condition, robot_row
 from experiments.scene.drawing import DARK, LIGHT, SceneDrawing, VisibleParts
-from experiments.scene.stage import MANY_GOALS, Condition, LinkTracker, Moment, SceneModel, touched
+from experiments.scene.stage import MANY_GOALS, LinkTracker, Moment, SceneModel, touched
 from experiments.view import heartbeat
 from experiments.view.acting import Acting, WatchedRun
 from experiments.view.observer import Observer
-from experiments.view.panel import PLOT_S, Panel, known, robot_row
+from experiments.view.panel import PLOT_S, Panel, known
 from twins.arrays import Array, norm
 
 if TYPE_CHECKING:

@@ -21,18 +21,8 @@ from agents.network.session import received
 from experiments.file import document
 from experiments.file.problems import DocumentError
 from experiments.metrics.clearance import Overlap
-from experiments.scene.stage import (
-    AT_REST,
-    SILENT_S,
-    TOUCH_S,
-    Condition,
-    LinkTracker,
-    Moment,
-    SceneModel,
-    Trail,
-    condition,
-    drawn_columns,
-)
+from experiments.scene.condition import AT_REST, SILENT_S, Condition, condition
+from experiments.scene.stage import TOUCH_S, LinkTracker, Moment, SceneModel, Trail, drawn_columns
 from experiments.view.heartbeat import DataAge
 
 UNKNOWN_S: Final = 2.0  # time without an experiment after which robots are drawn that are known by name only
@@ -255,8 +245,8 @@ class Observer:
     def condition(self, name: str) -> Condition:
         """Condition of a robot."""
         report, touches = self.robots[name], any(name in pair for pair in self._touching)
-        silent = time.monotonic() - report.heard_at > SILENT_S
-        return condition(report.status, alive=report.alive, silent=silent, touches=touches)
+        silent, alive = time.monotonic() - report.heard_at > SILENT_S, report.alive or not report.known
+        return condition(report.status, alive=alive, silent=silent, touches=touches)
 
     def moment(self) -> Moment:
         now, stage = time.monotonic(), self.stage

@@ -16,9 +16,10 @@ from agents.clock import wait_until
 from agents.decision.lifecycle import RUNNING, Phase
 from agents.network.messages import Event, Status
 from experiments.definition.plan import Plan
-from experiments.scene.stage import Condition, LinkTracker, Moment, SceneModel, Trail, condition, touched
+from experiments.scene.condition import Condition, condition, robot_row
+from experiments.scene.stage import LinkTracker, Moment, SceneModel, Trail, touched
 from experiments.view.live import FRAME_S, Page
-from experiments.view.panel import PLOT_S, known, robot_row
+from experiments.view.panel import PLOT_S, known
 from experiments.view.replay import ReplayClock, add_transport
 from experiments.virtual_time.simulation import Snapshot
 from twins.arrays import Array

@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from html import escape
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from agents.network.messages import Event, Status
+from agents.network.messages import Event
 from experiments.file.document import UNNAMED
+from experiments.scene.condition import CONDITIONS, RINGED, Condition, RobotRow
 from experiments.scene.stage import (
     BAD,
     CHASSIS,
-    CONDITIONS,
     FAIR,
     FAIR_M,
     GOOD,
     GOOD_M,
     PLACES,
     UNKNOWN,
-    Condition,
     SceneModel,
     link_colours,
 )
@@ -42,48 +40,6 @@ NONE: Final = "–"  # error of a robot that receives on no link
 QUIET: Final = ("output",)  # kinds of events that are not shown
 # the panel of a narrow page, which viser makes 20 em wide
 WHOLE_WIDTH: Final = "<style>@media(max-width:36em){[style*='width: 20em']{width:100%!important}}</style>"
-
-
-@dataclass(frozen=True)
-class RobotRow:
-    """One robot in the table; None where nothing is known."""
-
-    name: str
-    condition: Condition
-    error: float | None = None  # [m]
-    rate: float | None = None  # [1/s]
-    battery: float | None = None  # 0 to 1
-    missed: int | None = None  # ticks
-    missed_share: float = 0.0  # share of all ticks
-    delay: float | None = None  # [s] largest of its links
-    note: str = ""
-    measures: Mapping[str, float] = field(default_factory=dict)  # measures of its law
-
-    def measured(self, measures: Sequence[Mapping[str, float]], row: int) -> RobotRow:
-        """The same with the measures of its law, of those of all robots."""
-        return replace(self, measures=measures[row]) if measures else self
-
-
-def robot_row(
-    name: str,
-    condition: Condition,
-    status: Status | None,
-    error: float | None,
-    rate: float,
-    *,
-    delay: float | None = None,
-    ticks: bool = True,  # whether they can be missed
-    touches: str = "",  # contacts in words
-) -> RobotRow:
-    """The row of a robot by its last status."""
-    if status is None:
-        return RobotRow(name, condition, error, rate, delay=delay, note=touches)
-    note = status.hazard or (status.reason if condition > Condition.DONE else "")
-    if not note and status.missing:
-        note = "misses " + ", ".join(status.missing)
-    note = "; ".join(filter(None, (touches, note)))
-    missed, share = status.missed if ticks else None, status.missed / max(1, status.ticks + status.missed)
-    return RobotRow(name, condition, error, rate, status.battery, missed, share, delay, note)
 
 
 def known(value: float) -> float | None:
@@ -225,7 +181,7 @@ def _cells(row: RobotRow) -> tuple[str, ...]:
         "" if error is None else _coloured_error(error),
         "" if row.rate is None else f"{row.rate:.1f}",
         "" if row.battery is None else f"{100 * row.battery:.0f} %",
-        "" if row.missed is None else _coloured_missed(row.missed, row.missed_share),
+        "" if row.late is None else _coloured_missed(row.late, row.late_share),
         "" if row.delay is None else _milliseconds(row.delay),
     )
 
@@ -267,9 +223,11 @@ def table(rows: Sequence[RobotRow], stage: SceneModel) -> str:
     heads = "".join(f"<th style='text-align:right;font-weight:500;opacity:0.6'>{every[k]}</th>" for k in columns)
     lines = []
     for row, cells in zip(shown, filled, strict=True):
-        word, colour = CONDITIONS[row.condition]
+        colour = CONDITIONS[row.condition][1]
         dot = f"<span style='color:{css(colours.get(row.name, UNKNOWN))}'>&#9679;</span>"
-        badge = f" <span style='color:{css(colour)};font-weight:600'>{word}</span>" if word else ""
+        badge = f" <span style='color:{css(colour)};font-weight:600'>{escape(row.phase)}</span>" * (
+            row.condition > Condition.ACTIVE
+        )
         note = ""
         if row.note:
             noted = FAIR if row.condition == Condition.ACTIVE else colour  # a warning is never green
@@ -324,9 +282,7 @@ def legend() -> str:
     said = [f"<span style='color:{css(colour)}'>&#9473; {text}</span>" for colour, text in links]
     bodies = [f"<span style='background:{css(CHASSIS[place])};border:1px solid #888'>&nbsp;&nbsp;&nbsp;</span> {text}"
               for place, text in PLACES.items()]  # fmt: skip
-    states = [
-        f"<span style='color:{css(colour)}'>&#9711; {word}</span>" for word, colour in CONDITIONS.values() if word
-    ]
+    states = [f"<span style='color:{css(CONDITIONS[each][1])}'>&#9711; {CONDITIONS[each][0]}</span>" for each in RINGED]
     return (
         "<div style='padding:0 1em;font-size:0.75em'>"
         f"<div>links by error: {', '.join(said)}; wide when the sender transmits; dashed when broken</div>"

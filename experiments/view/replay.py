@@ -16,22 +16,11 @@ from agents.network.messages import Contact, Status, WorldState
 from experiments.metrics.clearance import Overlap
 from experiments.recording.playback import WholeRecording
 from experiments.recording.trace import ROUNDING_S
+from experiments.scene.condition import AT_REST, Condition, RobotRow, condition, robot_row
 from experiments.scene.drawing import SceneDrawing
-from experiments.scene.stage import (
-    AT_REST,
-    TOUCH_S,
-    TRAIL,
-    TRAIL_S,
-    Condition,
-    LinkTracker,
-    Moment,
-    SceneModel,
-    condition,
-    drawn_errors,
-    touched,
-)
+from experiments.scene.stage import TOUCH_S, TRAIL, TRAIL_S, LinkTracker, Moment, SceneModel, drawn_errors, touched
 from experiments.view.live import FRAME_S, IDLE_S, TABLE_S, Page
-from experiments.view.panel import HISTORY_S, PLOT_S, History, RobotRow, known, robot_row
+from experiments.view.panel import HISTORY_S, PLOT_S, History, known
 from twins.arrays import Array, Index
 
 if TYPE_CHECKING:

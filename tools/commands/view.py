@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 
     from experiments.real_time.hosts.run_registry import RegisteredRun
     from experiments.run import Watch
+    from experiments.scene.condition import RobotRow
     from experiments.view.acting import WatchedRun
     from experiments.view.serving import PageServer
-    from tools.live_table import LiveRow
     from tools.options import Place
 
 app: Final = typer.Typer()
@@ -158,14 +158,17 @@ class _Top:
 
     def _all_reported(self) -> bool:
         """Whether each robot has reported twice, or is gone."""
+        from experiments.scene.condition import Condition
+
         self._observer.update()
         reports = self._observer.robots
         return bool(reports) and all(
-            row.cpu is not None or row.rank == 0 or not reports[row.name].known for row in self._rows()
+            row.cpu is not None or row.condition >= Condition.STOPPED or not reports[row.name].known
+            for row in self._rows()
         )
 
-    def _rows(self) -> list[LiveRow]:
-        from experiments.scene.stage import Condition, condition, touched
+    def _rows(self) -> list[RobotRow]:
+        from experiments.scene.stage import touched
 
         observer, now = self._observer, self._observer.now()
         rows = []
@@ -173,16 +176,9 @@ class _Top:
         linked = {stage.names[row] for row in stage.links.receiver.tolist()}
         for name in [*stage.names, *sorted(observer.robots.keys() - {*stage.names})]:
             report = observer.robots[name]
-            status = report.status
-            known = condition(status, alive=report.alive or not report.known)
-            gone = {Condition.STOPPED: "stopped", Condition.DEAD: "lost"}.get(known, "")
-            rows.append(
-                self._trends.row(
-                    name, status, now=now,
-                    error=report.state.error if report.state is not None and (name in linked or not linked) else None,
-                    gone=gone, lost=bool(gone), touches=touched(name, observer.overlaps),
-                )
-            )  # fmt: skip
+            error = report.state.error if report.state is not None and (name in linked or not linked) else None
+            known, touches = observer.condition(name), touched(name, observer.overlaps)
+            rows.append(self._trends.row(name, known, report.status, error, now=now, touches=touches))
         return rows
 
     def _table(self, width: int, height: int) -> Group:

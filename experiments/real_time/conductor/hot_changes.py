@@ -25,8 +25,9 @@ from agents.runtime.orders import LAND, STOP
 from experiments.definition.experiment import WORLD, RobotTable
 from experiments.definition.plan import Plan
 from experiments.real_time.conductor.case_processes import CaseProcesses
-from experiments.real_time.conductor.run_view import FROZEN_S, NetworkView, RobotView
+from experiments.real_time.conductor.run_view import NetworkView, RobotView
 from experiments.real_time.hosts.launcher import LAND_S
+from experiments.scene.condition import SILENT_S
 
 CLIMB_S: Final = 15.0  # limit for a robot to climb
 READY_S: Final = 5.0  # a robot starts later, and counts the deadline of the file from then
@@ -237,12 +238,12 @@ class HotChanges:
             past = time.monotonic() - began
             if past > LAND_S and kept:
                 raise Refusal(f"{', '.join(still)}: ordered to land, but still there after {LAND_S:g} s; it {kept}")
-            if not (killed or kept) and (past > LAND_S or (past > FROZEN_S and all(map(self._frozen, still)))):
+            if not (killed or kept) and (past > LAND_S or (past > SILENT_S and all(map(self._frozen, still)))):
                 killed = True
                 for name in still:
                     self._view.report("killed", name, f"still there after {past:.0f} s")
                     processes.kill(name)
-            if past > LAND_S + FROZEN_S:
+            if past > LAND_S + SILENT_S:
                 raise Refusal(f"{', '.join(still)}: cannot be ended")
             yield
         for name in names:
@@ -251,8 +252,8 @@ class HotChanges:
         self._leaving -= {*names}  # the next end of a process is that of another one
 
     def _frozen(self, name: str) -> bool:
-        status = self._robots[name].status
-        return status is None or self._view.clock.utc() - status.stamp > FROZEN_S
+        view = self._robots[name]
+        return view.status is None or view.silent(self._view.clock.utc())
 
     def _admit(self, names: Sequence[str], order: messages.RunOrder) -> Steps:
         """Restart, or add: robots that were started by hand only get orders to join, all others are started."""
@@ -314,7 +315,7 @@ class HotChanges:
             for name in names:
                 order = messages.Order("start", at=self._start, origin=robots[name].origin)
                 yield from self._repeat_order(name, order)
-            yield from self._reach(names, "running", FROZEN_S)
+            yield from self._reach(names, "running", SILENT_S)
         except Refusal:
             self._leaving |= {*names}
             self._view.order(names, messages.Order("leave"))

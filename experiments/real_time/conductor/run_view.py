@@ -25,11 +25,11 @@ from experiments.definition import mesh
 from experiments.file import document
 from experiments.real_time.conductor import orders
 from experiments.real_time.conductor.case_processes import CaseContext
+from experiments.scene.condition import SILENT_S, Condition, condition
 
 ORDER: Final = tuple(phase.word for phase in Phase)
 AHEAD_S: Final = -0.02  # what comes before it was said is from a clock that is ahead [s],
 BEHIND_S: Final = 0.1  # delay that shows one that is behind
-FROZEN_S: Final = 3.0  # age of a status from which on a robot is shown as silent
 OTHERS_S: Final = 3.0  # limit for the conductor of the case before to leave the network
 LOOK_S: Final = 0.2  # pause of two looks for it
 ROUTER_S: Final = 10.0  # limit for a router that was just started to answer
@@ -68,6 +68,14 @@ class RobotView:
     def clock_off(self) -> float:
         """Time by which its clock is behind [s]; 0 if it is right, as far as its messages show."""
         return 0.0 if AHEAD_S < self.behind < BEHIND_S or self.behind == inf else self.behind
+
+    def silent(self, now: float) -> bool:
+        """Whether its last status is old at `now` [s, UTC]; it has none before its process begins."""
+        return self.status is not None and now - self.status.stamp > SILENT_S
+
+    def condition(self, now: float) -> Condition:
+        """Condition at `now` [s, UTC]."""
+        return condition(self.status, left=self.left_because, silent=self.silent(now))
 
     @property
     def phase(self) -> str:

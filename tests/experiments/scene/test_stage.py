@@ -14,7 +14,8 @@ from experiments.definition.experiment import Arena, LinkTable
 from experiments.definition.plan import Plan
 from experiments.file.document import load
 from experiments.scene import drawing, markers, models, stage
-from experiments.scene.stage import BodyLocation, Condition, LinkTracker, Moment, SceneModel, Trail
+from experiments.scene.condition import Condition
+from experiments.scene.stage import BodyLocation, LinkTracker, Moment, SceneModel, Trail
 from tests.experiments.traces import link_errors
 from tests.small import small
 from twins.scene import Obstacle
@@ -44,28 +45,6 @@ def at_start(park_scene):
     for row, robot in enumerate(park_scene.plan.experiment.robots.values()):
         moment.position[row] = (*robot.start[:2], robot.hover or 0.0)
     return moment
-
-
-@pytest.mark.parametrize(
-    ("said", "seen", "is_"),
-    [
-        (status(), {}, Condition.ACTIVE),
-        (status(), {"alive": False}, Condition.DEAD),
-        (status(), {"silent": True}, Condition.SILENT),
-        (status("landing"), {}, Condition.LANDING),
-        (status("done", reason="finished"), {"alive": False, "silent": True}, Condition.DONE),
-        (status("done", reason="its control loop hangs: no tick for 0.5 s"), {"alive": False}, Condition.OUT),
-        (status("done", reason="finished"), {"touches": True}, Condition.TOUCHING),
-        (status(), {"touches": True, "silent": True}, Condition.TOUCHING),
-        (status(), {"touches": True, "alive": False}, Condition.DEAD),
-        (status("done", reason="emergency stop by operator"), {}, Condition.STOPPED),
-        (status(hazard="hold: minimum separation: 0.18 m from CF03"), {}, Condition.HELD),
-        (status("ready"), {}, Condition.WAITING),
-        (None, {}, Condition.WAITING),
-    ],
-)
-def test_condition_of_a_robot(said, seen, is_):
-    assert stage.condition(said, **seen) == is_
 
 
 def test_bodies_and_links_are_told_apart():
@@ -111,11 +90,11 @@ def test_attention_has_ring_word_and_lit_links(park_scene):
     moment = at_start(park_scene)
     row = park_scene.names.index("CF02")
     moment.condition[:] = Condition.ACTIVE
-    moment.condition[row] = Condition.DEAD
+    moment.condition[row] = Condition.LOST
     places, _ = stage.rings(moment)
     assert np.flatnonzero(places[:, 2] > -100.0).tolist() == [row]
-    said = [stage.label(park_scene, row, condition) for condition in (Condition.DEAD, Condition.ACTIVE)]
-    assert said == ["CF02 · DEAD", "CF02"]
+    said = [stage.label(park_scene, row, condition) for condition in (Condition.LOST, Condition.ACTIVE)]
+    assert said == ["CF02 · LOST", "CF02"]
     assert (stage.accents(park_scene, moment)[row] != park_scene.colours[row]).any()
     moment.silent_for[park_scene.names.index("TB01")] = 0.05
     senders = {park_scene.names[row] for row in park_scene.links.sender[stage.lit(park_scene, moment)]}

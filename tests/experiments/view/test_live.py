@@ -24,13 +24,14 @@ from experiments.recording.playback import read_whole
 from experiments.recording.reader import RecordingError
 from experiments.run import simulate, simulate_seeds
 from experiments.scene import models
-from experiments.scene.stage import BAD, FAIR, PALED, RINGED, Condition, SceneModel, condition, touched
+from experiments.scene.condition import PALED, RINGED, Condition, RobotRow, condition, robot_row
+from experiments.scene.stage import BAD, FAIR, SceneModel, touched
 from experiments.view import live
 from experiments.view.acting import WatchedRun, may_act
 from experiments.view.broadcast import Broadcast
 from experiments.view.heartbeat import SLOWEST_S, DataAge, frame_s, mark
 from experiments.view.observer import Observer, RobotReport
-from experiments.view.panel import History, RobotRow, css, event_list, link_table, robot_row, table
+from experiments.view.panel import History, css, event_list, link_table, table
 from experiments.view.replay import Film, ReplayClock, marks
 from tests.cases import mostly_slow
 from tests.network import Mute, Net
@@ -291,7 +292,7 @@ def test_positions_are_those_of_the_recording(recorded_case, film):
     )
     silent = Film(replace(film.recording, trace=lost)).moment(2.5)
     assert silent.position == pytest.approx(film.moment(1.0).position, abs=1e-6)  # where they were last
-    assert set(silent.condition.tolist()) == {Condition.DEAD}
+    assert set(silent.condition.tolist()) == {Condition.LOST}
 
 
 def test_truncated_recording_is_replayed_to_its_end(recorded_case, tmp_path):
@@ -334,7 +335,7 @@ def test_the_clock_plays_pauses_and_ends():
 
 
 def test_table_has_recorded_content_and_no_empty_columns(film):
-    assert {(row.battery, row.missed) for t in (0.0, film.end) for row in film.rows(t)} == {(None, None)}
+    assert {(row.battery, row.late) for t in (0.0, film.end) for row in film.rows(t)} == {(None, None)}
     text = table(film.rows(film.end), film.stage)
     assert [word for word in ("f [Hz]", "battery", "missed", "delay", "nan", "None") if word in text] == ["f [Hz]"]
     first, *others = film.recording.statuses
@@ -342,7 +343,7 @@ def test_table_has_recorded_content_and_no_empty_columns(film):
     trace = replace(film.trace, clock="real")
     real = Film(replace(film.recording, trace=trace, statuses=((status,), *others)))
     rows = [*real.rows(1.5)[:2], real.rows(0.5)[0]]
-    assert [(row.battery, row.missed) for row in rows] == [(0.8, 3), (None, None), (None, None)]
+    assert [(row.battery, row.late) for row in rows] == [(0.8, 3), (None, None), (None, None)]
     text = table(real.rows(1.5), real.stage)
     assert [word for word in ("battery", ">80 %<") if word in text] == ["battery", ">80 %<"]
 
@@ -358,7 +359,7 @@ def test_curves_of_many_robots_are_three():
 def test_table_shows_the_worst_first_and_escapes_names(film):
     stage = film.stage
     rows = [RobotRow(f"R{k}", Condition.ACTIVE, error=0.001 * k) for k in range(30)]
-    rows[3] = RobotRow("<b>", Condition.DEAD, note="<script>", measures={"<i>": 0.12345})
+    rows[3] = RobotRow("<b>", Condition.LOST, note="<script>", measures={"<i>": 0.12345})
     text = table(rows, stage)
     assert text.index("&lt;b&gt;") < text.index("R29") < text.index("R28")
     assert [part in text for part in ("&lt;i&gt;", "and 10 more", "<script>", " R10<")] == [True, True, False, False]
@@ -371,8 +372,8 @@ def test_table_shows_the_worst_first_and_escapes_names(film):
 
 def test_warnings_misses_and_leaders_look_so(film):
     leader, follower, *_ = sorted(film.stage.names, key=lambda name: name != "TB01")
-    late = {"error": 0.01, "missed": 7, "missed_share": 0.5, "note": "warn: a neighbour is lost"}
-    rows = [RobotRow(leader, Condition.ACTIVE, missed=0, delay=-1e-6), RobotRow(follower, Condition.ACTIVE, **late)]
+    late = {"error": 0.01, "late": 7, "late_share": 0.5, "note": "warn: a neighbour is lost"}
+    rows = [RobotRow(leader, Condition.ACTIVE, late=0, delay=-1e-6), RobotRow(follower, Condition.ACTIVE, **late)]
     text = table(rows, film.stage)
     assert "-0.0" not in text
     for part in (">–<", f"color:{css(BAD)}'>50.0 %<", f"color:{css(FAIR)};padding-left:1.2em'>warn", ">0.0 %<"):

@@ -5,7 +5,9 @@ import pytest
 from rich.console import Console
 
 from agents.network.messages import Event, Status
-from tools.live_table import HEADS, LiveRow, Rank, Trends, drawn, heading, worst_first
+from experiments.real_time.conductor.run_view import RobotView
+from experiments.scene.condition import Condition, RobotRow, condition
+from tools.live_table import HEADS, Trends, drawn, heading, needs, worst_first
 
 STATUS = Status(
     "robot-01", 10.0, "running", "", "", 0.9, 100, 300, {"robot-02": 0}, {}, 0, 0, 500, 0, 500, 0, 0, 0.0, 1.0, [],
@@ -16,8 +18,8 @@ EVENTS = [Event(float(k), "hazard", "robot-01", f"number {k} " + "far " * 40) fo
 
 def rows(count):
     return [
-        LiveRow(f"robot-{k:02}", "running", error=0.001 * k, rate=12.5, late=0, lost=3, cpu=0.04, battery=0.8, sent=900,
-            note="", pid=k + 1)
+        RobotRow(f"robot-{k:02}", Condition.ACTIVE, "running", error=0.001 * k, rate=12.5, late=0, lost=3, cpu=0.04,
+            battery=0.8, sent=900, pid=k + 1)
         for k in range(count)
     ]  # fmt: skip
 
@@ -40,7 +42,7 @@ def styles(*rows):
 def test_table_fits_the_terminal_with_whole_names(width, height, count):
     held = msgspec.structs.replace(STATUS, hazard="hold: minimum separation: 0.18 m from robot-03 (limit 0.25 m)")
     all_rows = rows(count)
-    all_rows[-1] = Trends().row(f"robot-{count - 1:02}", held, now=10.1, error=0.0)
+    all_rows[-1] = Trends().row(f"robot-{count - 1:02}", Condition.HELD, held, 0.0, now=10.1)
     text = lines(heading("event: formation", 5.3, 15.0), all_rows, EVENTS, width, height)
     assert max(map(len, text)) <= width
     assert len(text) <= height
@@ -60,7 +62,7 @@ def test_table_fits_the_terminal_with_whole_names(width, height, count):
 def test_reason_is_whole_at_eighty_columns():
     reason = "its control loop hangs: no tick for 0.5 s, and it has landed by itself since then, as its watchdog says"
     done = msgspec.structs.replace(STATUS, phase="done", reason=reason)
-    all_rows = [*rows(5), Trends().row("robot-05", done, now=10.1, error=0.0)]
+    all_rows = [*rows(5), Trends().row("robot-05", condition(done), done, 0.0, now=10.1)]
     text = " ".join(line.strip() for line in lines("t", all_rows, EVENTS, 80, 24))
     assert f"robot-05: {reason}" in text
     assert text.count("number") == 5
@@ -74,48 +76,54 @@ def test_a_wide_table_has_all_columns_and_totals():
         assert figure in text[-1]
     assert text[2].startswith("robot-99"), "where rows do not fit, the largest error comes first"
     assert lines("realm park", [], EVENTS, 80, 24)[:2] == ["realm park", "  ".join(HEADS).rstrip()]
-    text = lines("t", [LiveRow("a\x1b[2J", "x\ny", note="\x1b]0;z\x07")], [Event(0.0, "k", "s", "\x1b[31m")], 100, 20)
+    text = lines(
+        "t",
+        [RobotRow("a\x1b[2J", Condition.ACTIVE, "x\ny", note="\x1b]0;z\x07")],
+        [Event(0.0, "k", "s", "\x1b[31m")],
+        100,
+        20,
+    )
     assert all(line.isprintable() for line in text)
 
 
 def test_rows_that_fit_stay_in_their_order():
     few = rows(5)
     assert worst_first(few, fit=True) == few
-    few[3] = LiveRow("robot-03", "lost", Rank.GONE)
+    few[3] = RobotRow("robot-03", Condition.LOST, "lost")
     assert [row.name for row in worst_first(few, fit=True)][:2] == ["robot-03", "robot-00"]
 
 
 def test_cpu_is_a_share_and_growing_counters_coloured():
     trends = Trends()
-    first = trends.row("robot-01", STATUS, now=10.0, error=None)
+    first = trends.row("robot-01", Condition.ACTIVE, STATUS, None, now=10.0)
     assert (first.cpu, first.growing) == (None, frozenset())
     later = msgspec.structs.replace(STATUS, stamp=12.0, cpu_s=2.1, missed=2, lost={"robot-02": 5}, battery=0.2)
     later = msgspec.structs.replace(later, sent=STATUS.sent + 6)
-    row = trends.row("robot-01", later, now=12.0, error=0.01)
+    row = trends.row("robot-01", Condition.ACTIVE, later, 0.01, now=12.0)
     assert (row.cpu, row.rate) == (pytest.approx(0.05), 3.0)
     assert row.growing == {"late", "lost"}
-    assert row.rank == Rank.LOW
+    assert needs(row) == (0, 0, 1, 1, 1)
     seen = styles(row)
     assert seen["2"] == seen["5"] == seen["20 %"] == "yellow"
-    flat = trends.row("robot-01", msgspec.structs.replace(later, battery=0.05), now=12.0, error=0.01)
-    held = trends.row("held-one", msgspec.structs.replace(later, hazard="hold: x"), now=12.0, error=0.01)
+    flat = trends.row("robot-01", Condition.ACTIVE, msgspec.structs.replace(later, battery=0.05), 0.01, now=12.0)
+    held = trends.row("held-one", Condition.HELD, msgspec.structs.replace(later, hazard="hold: x"), 0.01, now=12.0)
     seen = styles(flat, held)
     assert (seen["5 %"], seen["held-one"]) == ("bold red", "yellow")
     repeated = msgspec.structs.replace(later, stamp=20.0)
-    calm = trends.row("robot-01", repeated, now=20.0, error=0.01)
+    calm = trends.row("robot-01", Condition.ACTIVE, repeated, 0.01, now=20.0)
     assert (calm.growing, calm.cpu) == (frozenset(), 0.0)
     restarted = msgspec.structs.replace(later, stamp=21.0, pid=8, cpu_s=0.1)
-    assert trends.row("robot-01", restarted, now=21.0, error=None).cpu is None
+    assert trends.row("robot-01", Condition.ACTIVE, restarted, None, now=21.0).cpu is None
 
 
 def test_what_a_robot_needs():
-    for hazard, now, gone, rank, phase in (
-        ("", 10.5, "", Rank.FINE, "running"),
-        ("", 20.0, "", Rank.SILENT, "silent"),
-        ("hold: link silence", 10.5, "", Rank.HELD, "held"),
-        ("", 10.5, "lost", Rank.GONE, "lost"),
-        ("", 20.0, "removed", Rank.FINE, "removed"),
+    for hazard, now, left, urgent, phase in (
+        ("", 10.5, "", 0, "running"),
+        ("", 20.0, "", Condition.SILENT, "silent"),
+        ("hold: link silence", 10.5, "", Condition.HELD, "held"),
+        ("", 10.5, "lost", Condition.LOST, "lost"),
+        ("", 20.0, "removed", 0, "removed"),
     ):
-        status = msgspec.structs.replace(STATUS, hazard=hazard)
-        row = Trends().row("robot-01", status, now=now, error=None, gone=gone, lost=gone == "lost")
-        assert (row.rank, row.phase) == (rank, phase)
+        view = RobotView(msgspec.structs.replace(STATUS, hazard=hazard), left_because=left)
+        row = Trends().row("robot-01", view.condition(now), view.status, None, now=now, left=left)
+        assert (needs(row)[0], row.phase) == (urgent, phase)
