@@ -48,7 +48,7 @@ experiments.authoring experiments.real_time.processes
 experiments.real_time.hosts
 experiments.report experiments.real_time.conductor
 experiments.run
-experiments.sweep experiments.view experiments.learning
+experiments.course experiments.sweep experiments.view experiments.learning
 experiments.api
 tools.terminal
 tools.live_table tools.consent

@@ -29,7 +29,7 @@ Given = TypeVar("Given", str | None, list[str], list[str] | None)
 WIDEST: Final = 110  # columns of print
 CONNECT: Final = "ZENPARK_CONNECT"  # environment: default of --connect, endpoints with spaces between them
 PANELS: Final = {
-    "Experiments": "new check explain run sweep report export list import clean",
+    "Experiments": "new check explain run sweep report export list import course mark clean",
     "Watch": "view top runs keys echo",
     "Act": "robot world estop",
     "By hand": "router agent centre twin bridge",

@@ -28,6 +28,9 @@ class Follow(Law, frozen=True):
             x = view.position[0] - each.position[0] - each.link.relative[0]
             y = view.position[1] - each.position[1] - each.link.relative[1]
             said_x, said_y = each.said["v"]
-            ...  # a step of `view.step_s` [s] of Euler's method: vx and vy go towards said_x, said_y
+            # blank: ...  # a step of `view.step_s` [s] of Euler's method: vx and vy go towards said_x, said_y
+            vx += view.step_s * self.observer * (said_x - vx)
+            vy += view.step_s * self.observer * (said_y - vy)
+            # end of blank
         velocity = (vx - self.gain * x, vy - self.gain * y, nan)
         return Control(memory={"v": (vx, vy)}, velocity=velocity, measures={"lag": hypot(x, y)})

@@ -16,5 +16,8 @@ class Pursue(Law, frozen=True):
     def step(self, view, memory):
         x = sum(each.position[0] - view.position[0] for each in view.neighbours)
         y = sum(each.position[1] - view.position[1] for each in view.neighbours)
-        turned_x = turned_y = 0.0  # fill in: x, y turned to the right by the angle, times the gain
+        # blank: turned_x = turned_y = 0.0  # fill in: x, y turned to the right by the angle, times the gain
+        turned_x = self.gain * (cos(self.angle) * x + sin(self.angle) * y)
+        turned_y = self.gain * (cos(self.angle) * y - sin(self.angle) * x)
+        # end of blank
         return Control(velocity=(turned_x, turned_y, nan))

@@ -31,6 +31,9 @@ class Flock(Law, frozen=True):
             near = max(self.spacing - apart, 0.0)
             ax += self.push * near * away_x / apart
             ay += self.push * near * away_y / apart
-            ...  # alignment: the velocity of the neighbour is each.said["v"]
+            # blank: ...  # alignment: the velocity of the neighbour is each.said["v"]
+            ax += self.align * (each.said["v"][0] - vx)
+            ay += self.align * (each.said["v"][1] - vy)
+            # end of blank
         vx, vy = vx + view.step_s * ax, vy + view.step_s * ay
         return Control(memory={"v": (vx, vy)}, velocity=(vx, vy, nan))

@@ -17,7 +17,10 @@ class Cover(Law, frozen=True):
         own, others = view.position[:2], [each.position[:2] for each in view.neighbours]
         cell = []
         for place in GRID:
-            ...  # append the place to the cell if it is nearer to `own` than to any of the others: dist(place, own)
+            # blank: ...  # append the place to the cell if no other is nearer to it than `own`: dist(place, own)
+            if all(dist(place, own) <= dist(place, other) for other in others):
+                cell.append(place)
+            # end of blank
         if not cell:
             return Control()
         x, y = (sum(place[axis] for place in cell) / len(cell) for axis in (0, 1))

@@ -27,6 +27,15 @@ class Spread(Metric, frozen=True):
         return np.linalg.norm(place[:, None] - place, axis=2).max()
 
 
+class Length(Metric, frozen=True):
+    """Largest distance between two robots along x in the end."""
+
+    label, unit, per = "Length", "m", "case"
+
+    def of(self, trace, shared):
+        return np.ptp(end(trace)[0].mean(axis=0)[:, 0])
+
+
 class Drift(Metric, frozen=True):
     """Way of the mean of all robots, from the start to the end."""
 

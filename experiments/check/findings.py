@@ -16,6 +16,7 @@ SHOWN_FINDINGS: Final = 5  # findings of one sort; the others are counted
 NOT_RANDOM: Final = "not-random"  # code of the warning that no seed changes anything
 DEVICE: Final = "device"  # code of what bodies say of the devices of their robots
 FORGIVEN: Final = 1e-6  # allowance for rounding
+APART: Final = "drives-apart"  # code of a law that drives robots apart
 DELAYED: Final = 1.2  # times the acquisition without noise, from which on the one with noise is given as well
 MARK: Final[dict[Severity, str]] = {"error": "✗", "warning": "!", "remark": "·", "note": "✓"}
 

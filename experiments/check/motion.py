@@ -15,7 +15,7 @@ from agents.plugins.planners import Planner
 from agents.safety.hazards import Cause
 from experiments.check import noise
 from experiments.check.analysis import Analysis
-from experiments.check.findings import FORGIVEN, Finding, join_names
+from experiments.check.findings import APART, FORGIVEN, Finding, join_names
 from experiments.check.ideal_run import approaches
 from experiments.check.realisation import OFF, mirrored_robots
 from experiments.check.theory import strength
@@ -37,6 +37,7 @@ ACCELERATES_S: Final = 0.2  # [s] window of a mean acceleration
 BEGINS_M: Final = 0.15  # [m] distance of a robot from the begin of its recording: less than a goal may be away
 GRAVITY: Final = 9.81  # [m/s²]
 TILT: Final = math.radians(20.0)  # [rad] limit of tilt in the position controllers of small drones
+SPREADS: Final = 1.3  # growth of the distances between robots from which on a law drives them apart
 SETTLED: Final = 1e-3  # [m] travel per decision below which robots are at rest, and in `WINDOW_S` one on wheels stands
 
 
@@ -300,6 +301,9 @@ def walls(analysis: Analysis) -> Iterator[Finding]:
     beyond = np.maximum(track - limits.high, limits.low - track)  # (T, N, 3), positive outside
     outside = beyond.max(axis=2) > FORGIVEN
     beside = beyond[..., :2].max(axis=2) + _radii(analysis)  # (T, N), surfaces
+    if apart := _driven_apart(analysis, outside):
+        yield apart
+        return
     tight = beside > FORGIVEN - limits.margin
     tight &= ~tight[0]  # a start there is a finding of `starts`
     problems = [_left_arena(analysis, int(row), outside[:, row]) for row in np.flatnonzero(outside.any(axis=0))]
@@ -388,6 +392,30 @@ def _sources(analysis: Analysis, time: float, *robots: str) -> str:
         source = next((plan.source(time - at) for at, plan in reversed(begun) if at <= time), "")
         found += [source] if source else []
     return f" ({'; '.join(found)})" if found else ""
+
+
+def _driven_apart(analysis: Analysis, outside: Mask) -> Finding | None:
+    """Error of a law by which most robots leave the arena (T, N), farther from each other than they began."""
+    follow = analysis.placed
+    count = int(follow.sum())
+    if count < 2 or 2 * int(outside[:, follow].any(axis=0).sum()) <= count:
+        return None
+    first = int(outside[:, follow].any(axis=1).argmax())
+    place = analysis.prediction.position[[0, first]][:, follow]
+    begun, ended = norm(place[:, :, None] - place[:, None]).sum(axis=(1, 2)) / (count * (count - 1))
+    errors = analysis.error[[0, first]].mean(axis=1) if analysis.has_targets else np.array([0.0, 1.0])
+    if ended < SPREADS * begun or errors[1] <= errors[0]:
+        return None
+    row = int(np.flatnonzero(follow)[outside[first, follow].argmax()])
+    _, when = _first_time(analysis, row, outside[:, row])
+    return Finding(
+        "error",
+        APART,
+        f"the law drives the robots apart: on average {begun:.2f} m from each other at first, {ended:.2f} m when the "
+        f"first, {analysis.plan.names[row]}, would leave the arena {when}",
+        "is a sign turned round? A robot goes towards a neighbour along each.position - view.position",
+        ("formation", "law"),
+    )
 
 
 def _left_arena(analysis: Analysis, row: int, outside: Mask) -> Finding:

@@ -12,13 +12,13 @@ from tests.commands import ROOT, invoke, zenpark
 
 DOCS = ROOT / "docs"
 SHORT = ("shadow-twin", "two-crazyflies", "motion-capture", "three-machines", "lab-certificates")
-LONG = ("first-hour", "from-a-paper", "mixed-reality", "teaching", "course/solutions/README")  # 10 to 30 s each
+LONG = ("first-hour", "from-a-paper", "mixed-reality", "teaching")  # 10 to 30 s each
 GUIDES = (*SHORT, *LONG)
 STEP = re.compile(
     r"^```(?P<language>toml|python)\n(?P<block>(?s:.*?))^```|^ {4,}\./zenpark (?P<command>[^#\n]*)(?P<said>.*)",
     re.MULTILINE,
 )
-COMPUTING = {"lab", "check", "clean", "explain", "export", "import", "new", "report", "sweep"}
+COMPUTING = {"lab", "check", "clean", "course", "explain", "export", "import", "new", "report", "sweep"}
 REAL = (
     *("run way.toml", "run shadow.toml --out runs/shadow --open", "run measured.toml"),
     *("run two.toml --bodies protocol", "run three.toml --here"),

@@ -1,17 +1,23 @@
-"""Commands that write experiment files: a new one, one of Robotic Park's authors, or one of Crazyswarm2."""
+"""Commands that write experiment files: a new one, an import, the exercises of a course, which are then marked."""
 
 from __future__ import annotations
 
+import sys
 import textwrap
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 from typer import Argument, Option
 
 from experiments.catalogue import index
 from tools.options import WIDEST, AsJson, example, print_result, warn
+from tools.terminal import say
+
+if TYPE_CHECKING:
+    from experiments.course.marking import Mark
 
 app: Final = typer.Typer()
 
@@ -101,3 +107,76 @@ def import_(
         lines.append("Not carried over, or not as it was:")
     lines += [textwrap.fill(note, WIDEST, initial_indent="  - ", subsequent_indent="    ") for note in notes]
     print_result({"file": path, "notes": notes}, *lines, as_json=as_json)
+
+
+Origin = Annotated[
+    Path | None, Option("--from", metavar="COURSE", help="Folder of a course of your own, with solutions. [zenpark's]")
+]
+
+
+@app.command(epilog=example("course exercises"))
+def course(
+    folder: Annotated[Path, Argument(metavar="FOLDER", help="Folder to write them into.")], *, origin: Origin = None
+) -> None:
+    """Write the exercises of the course, without their solutions, into a folder."""
+    from experiments.course.exercises import OURS, read_course, write_exercises
+
+    known = read_course(origin or OURS)
+    write_exercises(known, folder)
+    first = folder / next(iter(known.exercises.values())).file
+    print(f"{folder}: {len(known.exercises)} exercises; fill in what is blank, then `./zenpark run {first} --virtual`")
+
+
+@app.command(epilog=example("mark groups/*", "mark groups/* --only 04-events --seeds 10"))
+def mark(
+    folders: Annotated[list[Path], Argument(metavar="FOLDER...", help="Of each group, with the files it filled in.")],
+    *,
+    origin: Origin = None,
+    only: Annotated[
+        list[str] | None, Option("--only", metavar="EXERCISE", help="Only this exercise; may be repeated.")
+    ] = None,
+    seeds: Annotated[int, Option(min=1, max=1000, help="Number of seeds, all of which must pass.")] = 3,
+    seed: Annotated[int | None, Option(min=0, help="The first of them. [an unknown one]")] = None,
+    limit: Annotated[int, Option(min=1, help="Computing time for an exercise of a group [s].")] = 60,
+    as_json: AsJson = False,
+) -> int:
+    """Mark what groups handed in, each in a process with limits; exit code 1 unless all criteria are met."""
+    import secrets
+
+    from agents.errors import did_you_mean
+    from experiments.course.exercises import OURS, CourseError, read_course
+    from experiments.course.marking import DEFAULT, SOLUTION, marks
+
+    known = read_course(origin or OURS)
+    if unknown := next((name for name in only or [] if name not in known.exercises), None):
+        raise CourseError(f"no exercise '{unknown}'; {did_you_mean(unknown, known.exercises)}")
+    asked = {name: each for name, each in known.exercises.items() if not only or name in only}
+    first = secrets.randbelow(1_000_000) if seed is None else seed
+    found = []
+    limits = DEFAULT._replace(cpu_s=limit)
+    for each in marks(known, [*asked.values()], folders, range(first, first + seeds), limits):
+        found.append(each)
+        say(*(f"{each.group} {each.exercise}: {word}" for word in each.words), to=sys.stderr)
+    names = [SOLUTION, *(folder.resolve().name for folder in folders)]
+    found.sort(key=lambda each: (names.index(each.group), each.exercise))
+    passed = all(each.passed for each in found)
+    again = f"seeds {first} to {first + seeds - 1}; the same again with --seed {first}"
+    result = {"passed": passed, "seed": first, "seeds": seeds, "marks": found}
+    print_result(result, *_table(found, [*asked]), again, as_json=as_json)
+    return int(not passed)
+
+
+def _table(found: Sequence[Mark], exercises: Sequence[str]) -> list[str]:
+    """A line for each group: criteria met of those that there are, by exercise; `-` where nothing was handed in."""
+    groups: dict[str, dict[str, Mark]] = {}
+    for each in found:
+        groups.setdefault(each.group, {})[each.exercise] = each
+    wide = max(map(len, groups))
+    of = sum(each.of for each in next(iter(groups.values())).values())
+    heads = [name.partition("-")[0][:8] for name in exercises]
+    lines = [f"{'group':<{wide}}  " + "".join(f"{head:>6}" for head in heads) + f"{'all':>8}"]
+    for group, marks in groups.items():
+        cells = [f"{each.met}/{each.of}" if each.of else "-" for each in map(marks.__getitem__, exercises)]
+        all_met = f"{sum(each.met for each in marks.values())}/{of}"
+        lines.append(f"{group:<{wide}}  " + "".join(f"{cell:>6}" for cell in cells) + f"{all_met:>8}")
+    return lines

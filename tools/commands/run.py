@@ -123,8 +123,9 @@ def _run(origin: RunOrigin, handling: Handling, *, former: Path | None = None, b
     check_folder(handling.out)
     _refuse(origin, handling)
     real = not origin.virtual and origin.bodies is None
-    if not sound(read, origin.cases, real=real, seeds=origin.seeds, as_json=handling.as_json, anyway=origin.anyway):
-        return 2
+    seeds, as_json, anyway = origin.seeds, handling.as_json, origin.anyway
+    if code := refused(read, origin.cases, real=real, seeds=seeds, as_json=as_json, anyway=anyway):
+        return code
     if not origin.virtual:
         from experiments.real_time.conductor.conduct import with_bodies
         from tools import consent
@@ -350,15 +351,19 @@ def _refuse(origin: RunOrigin, handling: Handling) -> None:
             raise refusal("--seeds", "one run is viewed", "leave out --view or --seeds")
 
 
-def sound(read: Document, cases: Sequence[str] = (), *, real: bool, seeds: int, as_json: bool, anyway: bool) -> bool:
-    """Print the warnings and errors of the check of a run, errors that prevent it as JSON too; False if there are such.
+def refused(read: Document, cases: Sequence[str] = (), *, real: bool, seeds: int, as_json: bool, anyway: bool) -> int:
+    """Print the warnings and errors of the check of a run, errors that prevent it as JSON too.
 
     Of the devices of robots only those of a run with `real` bodies.
 
-    Raises DocumentError if there is no such case.
+    Returns:
+        Exit code of the refusal, 0 for none; `FAILED` where robots flee each other, which no criterion is met by.
+
+    Raises:
+        DocumentError: If there is no such case.
     """
     from experiments.check.check import check
-    from experiments.check.findings import DEVICE, NOT_RANDOM
+    from experiments.check.findings import APART, DEVICE, NOT_RANDOM
 
     found = [finding for finding in check(read, cases) if finding.severity in {"error", "warning"}]
     if not real:
@@ -366,12 +371,18 @@ def sound(read: Document, cases: Sequence[str] = (), *, real: bool, seeds: int, 
     if seeds == 1:
         found = [finding for finding in found if finding.code != NOT_RANDOM]
     say(*map(str, found), to=sys.stderr)
-    if anyway or all(finding.severity != "error" for finding in found):
-        return True
+    errors = {finding.code for finding in found if finding.severity == "error"}
+    if anyway or not errors:
+        return 0
+    criteria = read.experiment.criteria if errors == {APART} else ()
     if as_json:
-        print_json({"ok": False, "error": "the check found errors", "findings": found})
+        verdict = {"passed": False} if criteria else {}
+        print_json({"ok": False, "error": "the check found errors", "findings": found, **verdict})
+    if criteria:
+        say(*(f"✗ Not passed. {each.why}" for each in criteria[:1]), to=sys.stderr)
+        return FAILED
     print("zenpark: not run; mend the file (`./zenpark check` says more), or run it --anyway", file=sys.stderr)
-    return False
+    return 2
 
 
 def _command(origin: RunOrigin, options: RunOptions) -> str:

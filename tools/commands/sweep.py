@@ -79,13 +79,13 @@ def sweep(
     from experiments.file.document import load
     from experiments.recording.run_folder import SWEEP, naming
     from experiments.sweep import table as tables
-    from tools.commands.run import sound
+    from tools.commands.run import refused
 
     changes = settings or []
     read = load(file, *changes)
     _parse_axes(read, file, changes, given or [], case or [])
-    if not sound(read, real=False, seeds=2, as_json=as_json, anyway=anyway):
-        return 2
+    if code := refused(read, real=False, seeds=2, as_json=as_json, anyway=anyway):
+        return code
     options = {"settings": changes, "cases": case or [], "out": out, "scheduler": scheduler, "processes": processes}
     if optimise is None:
         found, more, lines, code = _sweep(file, given or [], options)

@@ -1,0 +1,157 @@
+"""Exercises of a course, made from its solved files.
+
+A course is a folder of experiment files, of the laws that they name, and of what else these need. What is to be filled
+in stands there solved, between two comments, of which the first has what stands in the exercise instead:
+
+    # blank: ...  # add the way from x to the x of `each.position`
+    to_x += each.position[0] - x
+    # end of blank
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from agents.errors import ExplainedError
+from experiments.file.document import inline
+from experiments.file.text import content, parsed
+
+OURS: Final = Path(__file__).parents[2] / "docs" / "course"  # course of zenpark, in a checkout
+_BLANK: Final = re.compile(r"^( *)# blank: (.*)\n(?:.*\n)*?^ *# end of blank\n", re.MULTILINE)
+_PLUGIN_FILE: Final = re.compile(r"[\"']([^\"':/\\]+\.py):")  # Python file that an experiment names
+Table = Mapping[str, Any]
+
+
+class CourseError(ExplainedError, ValueError):
+    """A course, or what was handed in, that cannot be used."""
+
+
+@dataclass(frozen=True)
+class Exercise:
+    """One exercise: an experiment file with blanks, and with criteria that judge how they are filled in.
+
+    Attributes:
+        name: Of the file, without its suffix.
+        laws: Names of the Python files with blanks that it names.
+        blanks: Paths of the values in the file, or of tables with more keys, that are to be filled in.
+        posed: Content of the file with the blanks.
+    """
+
+    name: str
+    laws: tuple[str, ...]
+    blanks: tuple[tuple[str, ...], ...]
+    posed: Table
+
+    @property
+    def file(self) -> str:
+        """Name of the experiment file."""
+        return f"{self.name}.toml"
+
+    @property
+    def parts(self) -> list[str]:
+        """Names of the files that hold blanks."""
+        return [*([self.file] if self.blanks else []), *self.laws]
+
+    @property
+    def criteria(self) -> int:
+        """Number of criteria."""
+        return len(self.posed.get("criteria", ()))
+
+    def filled(self, text: str, label: str) -> list[str]:
+        """Values for the blanks in a text of this file, as `path=value`; all else in it is left out.
+
+        Raises DocumentError for a text that is no TOML, CourseError for a value that no experiment holds.
+        """
+        given = parsed(text, label, json=False)
+        try:
+            return [f"{_dotted(path)}={inline(value)}" for path, value in self._filled(given)]
+        except TypeError as error:
+            raise CourseError(f"{label}: {error}; give a number, a text, a list or a table") from None
+
+    def _filled(self, given: Table) -> Iterator[tuple[tuple[str, ...], Any]]:
+        for path in self.blanks:
+            asked, value = _at(self.posed, path), _at(given, path)
+            if isinstance(asked, Mapping) and isinstance(value, Mapping):
+                yield from (((*path, key), value[key]) for key in value if key not in asked)
+            elif value is not None:
+                yield path, value
+
+
+@dataclass(frozen=True)
+class Course:
+    """Exercises by name, and all files as students get them."""
+
+    exercises: Mapping[str, Exercise]
+    files: Mapping[str, str]
+    solved: Mapping[str, str]
+
+
+def posed(text: str) -> str:
+    """A solved text with its blanks empty."""
+    return _BLANK.sub(r"\1\2\n", text)
+
+
+def read_course(folder: Path) -> Course:
+    """The course in a folder; raises CourseError if it has no exercise."""
+    names = sorted(file.name for pattern in ("*.toml", "*.py") for file in folder.glob(pattern))
+    solved = {name: content(folder / name, str(folder / name)) for name in names}
+    files = {name: posed(text) for name, text in solved.items()}
+    exercises = {}
+    for name in names:
+        if not name.endswith(".toml"):
+            continue
+        asked, answer = (parsed(texts[name], str(folder / name), json=False) for texts in (files, solved))
+        laws = dict.fromkeys(each for each in _PLUGIN_FILE.findall(solved[name]) if files.get(each) != solved.get(each))
+        if laws or asked != answer:
+            stem = name.removesuffix(".toml")
+            exercises[stem] = Exercise(stem, tuple(laws), tuple(_blanks(asked, answer)), asked)
+    if not exercises:
+        place = "is no folder" if not folder.is_dir() else "holds no exercise"
+        raise CourseError(
+            f"{folder} {place}; name one of files with `# blank: ...` and `# end of blank` (docs/teaching.md)"
+        )
+    return Course(exercises, files, solved)
+
+
+def write_exercises(course: Course, folder: Path) -> None:
+    """Write the exercises into a folder, which is made; raises CourseError for one that has such files."""
+    if known := sorted(name for name in course.files if (folder / name).exists()):
+        raise CourseError(f"{folder / known[0]} is there already; name another folder")
+    write(course.files, folder)
+
+
+def write(files: Mapping[str, str], folder: Path) -> None:
+    """Write texts by their names into a folder, which is made; raises CourseError if that cannot be done."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, text in files.items():
+            (folder / name).write_text(text, "utf-8")
+    except OSError as error:
+        raise CourseError(f"{error.filename}: cannot be written: {error.strerror}; name another folder") from None
+
+
+def _blanks(asked: Table, answer: Table, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """Paths at which two documents differ: of a value, or of the table that has other keys."""
+    if asked.keys() != answer.keys():
+        yield path
+    for key in asked.keys() & answer.keys():
+        one, other = asked[key], answer[key]
+        if isinstance(one, dict) and isinstance(other, dict):
+            yield from _blanks(one, other, (*path, key))
+        elif one != other:
+            yield (*path, key)
+
+
+def _at(document: Any, path: tuple[str, ...]) -> Any:  # noqa: ANN401 - a value of a file
+    """The value at a path; None if there is none."""
+    for key in path:
+        document = document.get(key) if isinstance(document, Mapping) else None
+    return document
+
+
+def _dotted(path: tuple[str, ...]) -> str:
+    return ".".join(f'"{key}"' for key in path)
