@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Final
 
@@ -111,10 +111,6 @@ class RobotRow:
     cpu: float | None = None  # share of a core; of its process, if several robots share one
     growing: frozenset[str] = frozenset()  # counters "late" and "lost" that grew in the last seconds
 
-    def measured(self, measures: Sequence[Mapping[str, float]], row: int) -> RobotRow:
-        """The same with the measures of its law, of those of all robots."""
-        return replace(self, measures=measures[row]) if measures else self
-
 
 def robot_row(
     name: str,
@@ -127,6 +123,7 @@ def robot_row(
     delay: float | None = None,
     ticks: bool = True,  # whether they can be missed
     touches: str = "",  # contacts in words
+    measures: Mapping[str, float] | None = None,  # measures of its law
 ) -> RobotRow:
     """The row of a robot by its last status.
 
@@ -134,7 +131,7 @@ def robot_row(
     """
     word = left or CONDITIONS[condition][0] or ("starting" if status is None else status.phase)
     if status is None:
-        return RobotRow(name, condition, word, error, rate, delay=delay, note=touches)
+        return RobotRow(name, condition, word, error, rate, delay=delay, note=touches, measures=measures or {})
     trouble = status.hazard or (status.reason if condition != Condition.DONE else "")
     if not trouble and status.missing:
         trouble = "misses " + ", ".join(status.missing)
@@ -143,5 +140,6 @@ def robot_row(
     late, share = status.missed if ticks else None, status.missed / max(1, status.ticks + status.missed)
     return RobotRow(
         name, condition, word, error, rate, late, share, sum(status.lost.values()), delay, status.battery, status.sent,
-        "; ".join(filter(None, (touches, trouble, *counts))), bool(status.hazard), pid=status.pid,
+        "; ".join(filter(None, (touches, trouble, *counts))), bool(status.hazard), measures or {},
+        status.pid,
     )  # fmt: skip

@@ -18,13 +18,12 @@ import zenoh
 
 from agents.network.keys import Keys
 from agents.network.session import connected
-from experiments.scene.condition import Condition, robot_row
 from experiments.scene.drawing import DARK, LIGHT, SceneDrawing, VisibleParts
-from experiments.scene.stage import MANY_GOALS, LinkTracker, Moment, SceneModel, touched
+from experiments.scene.stage import MANY_GOALS, LinkTracker, Moment, SceneModel
 from experiments.view import heartbeat
 from experiments.view.acting import Acting, WatchedRun
 from experiments.view.observer import Observer
-from experiments.view.panel import PLOT_S, Panel, known
+from experiments.view.panel import PLOT_S, Panel, robot_rows
 from twins.arrays import Array, norm
 
 if TYPE_CHECKING:
@@ -241,14 +240,11 @@ class LiveView:
     def _tabulate(self, moment: Moment) -> None:
         observer = self.observer
         stage, panel = self.observer.stage, self._page.panel
-        errors = self._errors.of_robots(moment.error)
-        rows = []
-        for k, name in enumerate(stage.names):
-            report, condition = observer.robots[name], Condition(int(moment.condition[k]))
-            delay = max(report.delay.values(), default=None)
-            touches = touched(name, moment.overlaps)
-            row = robot_row(name, condition, report.status, known(errors[k]), report.rate, delay=delay, touches=touches)
-            rows.append(row.measured(moment.measures, k))
+        reports = [observer.robots[name] for name in stage.names]
+        rows = robot_rows(
+            stage.names, moment, [each.status for each in reports], self._errors.of_robots(moment.error),
+            [each.rate for each in reports], delay=[max(each.delay.values(), default=None) for each in reports],
+        )  # fmt: skip
         if self._elapsed is None or not (self._over or observer.ended):
             self._elapsed = observer.elapsed
         phase = observer.phase

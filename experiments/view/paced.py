@@ -16,10 +16,10 @@ from agents.clock import wait_until
 from agents.decision.lifecycle import RUNNING, Phase
 from agents.network.messages import Event, Status
 from experiments.definition.plan import Plan
-from experiments.scene.condition import Condition, condition, robot_row
-from experiments.scene.stage import LinkTracker, Moment, SceneModel, Trail, touched
+from experiments.scene.condition import condition
+from experiments.scene.stage import LinkTracker, Moment, SceneModel, Trail
 from experiments.view.live import FRAME_S, Page
-from experiments.view.panel import PLOT_S, known
+from experiments.view.panel import PLOT_S, known, robot_rows
 from experiments.view.replay import ReplayClock, add_transport
 from experiments.virtual_time.simulation import Snapshot
 from twins.arrays import Array
@@ -148,13 +148,8 @@ class PacedView:
     def _tabulate(self, instant: Snapshot, moment: Moment) -> None:
         errors = self._tracker.of_robots(moment.error)
         panel = self._page.panel
-        rows = [
-            robot_row(
-                status.robot, Condition(int(moment.condition[k])), status, known(errors[k]), float(len(self._sent[k])),
-                ticks=False, touches=touched(status.robot, moment.overlaps),
-            ).measured(moment.measures, k)
-            for k, status in enumerate(self._statuses(instant))
-        ]  # fmt: skip
+        rate = [float(len(each)) for each in self._sent]
+        rows = robot_rows(self._stage.names, moment, self._statuses(instant), errors, rate, ticks=False)
         phase = "running" if moment.time is not None and moment.time >= 0.0 else "taking off"
         where = f"virtual time, {self.clock.speed:g} times as fast" + ("" if self.clock.playing else ", paused")
         panel.show_head(self._case, phase, moment.time, self._plan.experiment.duration_s, where)

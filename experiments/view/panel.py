@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from agents.network.messages import Event
+from agents.network.messages import Event, Status
 from experiments.file.document import UNNAMED
-from experiments.scene.condition import CONDITIONS, RINGED, Condition, RobotRow
+from experiments.scene.condition import CONDITIONS, RINGED, Condition, RobotRow, robot_row
 from experiments.scene.stage import (
     BAD,
     CHASSIS,
@@ -20,8 +20,10 @@ from experiments.scene.stage import (
     GOOD_M,
     PLACES,
     UNKNOWN,
+    Moment,
     SceneModel,
     link_colours,
+    touched,
 )
 from twins.arrays import Array
 
@@ -45,6 +47,21 @@ WHOLE_WIDTH: Final = "<style>@media(max-width:36em){[style*='width: 20em']{width
 def known(value: float) -> float | None:
     """A number for a row; None for NaN."""
     return None if np.isnan(value) else float(value)
+
+
+def robot_rows(
+    names: Sequence[str], moment: Moment, statuses: Sequence[Status | None], error: Array, rate: Sequence[float],
+    *, delay: Sequence[float | None] = (), ticks: bool = True,
+) -> list[RobotRow]:  # fmt: skip
+    """The rows of all robots at a moment; errors (N,) [m], rates [1/s], and largest delays [s] if known."""
+    return [
+        robot_row(
+            name, Condition(int(moment.condition[k])), status, known(error[k]), rate[k], ticks=ticks,
+            delay=delay[k] if delay else None, touches=touched(name, moment.overlaps),
+            measures=moment.measures[k] if moment.measures else {},
+        )
+        for k, (name, status) in enumerate(zip(names, statuses, strict=True))
+    ]  # fmt: skip
 
 
 class History:

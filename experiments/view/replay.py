@@ -16,11 +16,11 @@ from agents.network.messages import Contact, Status, WorldState
 from experiments.metrics.clearance import Overlap
 from experiments.recording.playback import WholeRecording
 from experiments.recording.trace import ROUNDING_S
-from experiments.scene.condition import AT_REST, Condition, RobotRow, condition, robot_row
+from experiments.scene.condition import AT_REST, Condition, RobotRow, condition
 from experiments.scene.drawing import SceneDrawing
-from experiments.scene.stage import TOUCH_S, TRAIL, TRAIL_S, LinkTracker, Moment, SceneModel, drawn_errors, touched
+from experiments.scene.stage import TOUCH_S, TRAIL, TRAIL_S, LinkTracker, Moment, SceneModel, drawn_errors
 from experiments.view.live import FRAME_S, IDLE_S, TABLE_S, Page
-from experiments.view.panel import HISTORY_S, PLOT_S, History, known
+from experiments.view.panel import HISTORY_S, PLOT_S, History, robot_rows
 from twins.arrays import Array, Index
 
 if TYPE_CHECKING:
@@ -101,15 +101,9 @@ class Film:
     def rows(self, t: float) -> list[RobotRow]:
         """The table at `t` [s]."""
         moment, statuses = self.moment(t), self._statuses(t)
-        errors = self.links.of_robots(moment.error)
+        rate = [float(np.subtract(*np.searchsorted(each, (t, t - 1.0), side="right"))) for each in self._sent]
         ticks = self.trace.clock == "real"  # virtual time misses none
-        rows = []
-        for k, name in enumerate(self.trace.robots):
-            rate = float(np.subtract(*np.searchsorted(self._sent[k], (t, t - 1.0), side="right")))
-            condition, touches = Condition(int(moment.condition[k])), touched(name, moment.overlaps)
-            row = robot_row(name, condition, statuses[k], known(errors[k]), rate, ticks=ticks, touches=touches)
-            rows.append(row.measured(moment.measures, k))
-        return rows
+        return robot_rows(self.trace.robots, moment, statuses, self.links.of_robots(moment.error), rate, ticks=ticks)
 
     def history(self) -> History:
         """Errors and rates of the whole case, four times a second."""
