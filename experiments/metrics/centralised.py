@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 from itertools import pairwise
-from typing import Any
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -22,7 +22,7 @@ def _delays(delay: Array) -> dict[str, float | None]:
     return {f"delay_{what}_s": float(each) for what, each in found.items()}
 
 
-def columns(trace: Trace, net: Links) -> dict[str, list[Any]]:
+def columns(trace: Trace, net: Links) -> SimpleNamespace:
     """Receivers, deliveries and goals of each robot (N,), as fields of its metrics; `net` are the formation's links."""
     rows, goals = len(trace.robots), trace.goals
     guided = np.isin(np.array(trace.robots), trace.plan.guided)  # the centre receives their neighbours' poses
@@ -32,19 +32,17 @@ def columns(trace: Trace, net: Links) -> dict[str, list[Any]]:
     counted = np.zeros((rows, rows), dtype=bool)  # links for avoidance alone do not belong to the formation
     counted[net.receiver, net.sender] = ~guided[net.receiver]
     taken = trace.received.link[counted[ends.receiver, ends.sender][trace.received.link]]
-    nothing = np.zeros(rows, dtype=np.intp)
     found = {
         "receivers": np.bincount(net.sender[~guided[net.receiver]], minlength=rows) + to_centre,
-        "received": np.bincount(ends.sender[taken], minlength=rows) + (nothing if goals is None else goals.received),
-        "goals": nothing if goals is None else np.bincount(goals.sent.link, minlength=rows),
-        "goal_bytes": nothing
-        if goals is None
-        else np.bincount(goals.sent.link, weights=goals.sent.bytes, minlength=rows).astype(np.intp),
+        "received": np.bincount(ends.sender[taken], minlength=rows),
+        **dict.fromkeys(("goals", "goal_bytes"), np.zeros(rows, dtype=np.intp)),
     }
     delays = [_delays(np.zeros(0) if goals is None else goals.delay[goals.follower == row]) for row in range(rows)]
-    return {name: column.tolist() for name, column in found.items()} | {
-        name: [each[name] for each in delays] for name in delays[0]
-    }
+    if goals is not None:
+        size = np.bincount(goals.sent.link, weights=goals.sent.bytes, minlength=rows).astype(np.intp)
+        found["received"] += goals.received
+        found |= {"goals": np.bincount(goals.sent.link, minlength=rows), "goal_bytes": size}
+    return SimpleNamespace(**found, **{name: [each[name] for each in delays] for name in delays[0]})
 
 
 def deliveries(trace: Trace) -> int:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property, wraps
 from itertools import pairwise
 from math import inf, nan
+from types import SimpleNamespace
 from typing import Any, Final, NamedTuple, TypeVar
 from weakref import WeakKeyDictionary
 
@@ -525,7 +526,7 @@ class Measurement:
         return [[each for each in self.collisions if name in {each.first, each.second}] for name in self.trace.robots]
 
     @_kept
-    def architecture(self) -> dict[str, list[Any]]:
+    def architecture(self) -> SimpleNamespace:
         """Receivers, deliveries and goals of each robot, see `centralised.columns`."""
         return centralised.columns(self.trace, self.errors.net)
 
