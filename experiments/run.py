@@ -280,8 +280,8 @@ def reopen(folder: str | Path) -> Run:
         of_sweep = f"is that of a sweep, which keeps no recordings; `./zenpark report {folder}` draws its figures"
         what = of_sweep if (folder / SWEEP).is_file() else "holds no recording (.mcap); name the folder of a run"
         raise RecordingError(f"{folder}: {what}")
-    told = origin.failures if (origin := read_origin(folder)) else []
-    found = read_back(folder, {file.stem: file for file in files}, [], told)
+    failures = origin.failures if (origin := read_origin(folder)) else []
+    found = read_back(folder, {file.stem: file for file in files}, [], failures)
     seeds = {each.seed for each in figures}
     if len(seeds) > 1:
         note = f"{ALONE} {found.seed} of {len(seeds)}: of the others metrics are kept, `reopen_seeds` gives them"
@@ -340,12 +340,12 @@ def pool_seeds(folders: Sequence[str], read: Sequence[Sequence[Run]]) -> list[Ru
     first = {case: read[0][0].traces[case] for case in cases}
     for folder, (run, *_) in zip(folders, read, strict=True):
         for case, trace in first.items():
-            mine = run.traces[case]
-            if mine.plan.changed(seed=0) != trace.plan.changed(seed=0):
+            same = run.traces[case]
+            if same.plan.changed(seed=0) != trace.plan.changed(seed=0):
                 hint = f"compare them without --pool: `./zenpark report {folders[0]} {folder}`"
                 raise refusal(folder, f"differs from {folders[0]} in more than its seed", hint)
-            if mine.clock != trace.clock:
-                raise refusal(folder, f"is of {mine.clock} time, {folders[0]} of {trace.clock} time", "pool them apart")
+            if same.clock != trace.clock:
+                raise refusal(folder, f"is of {same.clock} time, {folders[0]} of {trace.clock} time", "pool them apart")
     seeds = [run.seed for run in every]
     if twice := sorted({seed for seed in seeds if seeds.count(seed) > 1}):
         raise refusal("--pool", f"seed {twice[0]} is there twice", "give each run a --seed of its own")
@@ -394,8 +394,8 @@ def read_back(folder: Path, recordings: Mapping[str, Path], notes: Sequence[str]
         remarks.append(f"the recordings are of different seeds: {seeds}")
     metrics = {}
     for case, trace in traces.items():
-        told = [each.removeprefix(f"{case}: ") for each in failures if each.startswith(f"{case}: ")]
-        metrics[case] = comparable.with_failures(measure.measure(trace), told)
+        of_case = [each.removeprefix(f"{case}: ") for each in failures if each.startswith(f"{case}: ")]
+        metrics[case] = comparable.with_failures(measure.measure(trace), of_case)
     source, first = folder / SOURCE, next(iter(traces.values()), None)
     files = [source, *sorted(set(folder.glob("*.toml")) - {source})] if source.exists() else []
     text = document.join_texts([file.read_text("utf-8") for file in files])

@@ -104,11 +104,11 @@ def table_faults(
         plugin: Group and kind, if these are a plug-in's parameters.
     """
     fields = fields_of(struct)
-    found, meant = [], set()
+    found, guessed = [], set()
     for key in value:
         if key not in fields:
             hint = did_you_mean(key, fields)
-            meant |= {name for name in fields if hint == f"did you mean '{name}'?"}
+            guessed |= {name for name in fields if hint == f"did you mean '{name}'?"}
             found.append(_unknown(key, hint, path, plugin))
     for name, field in fields.items():
         if name in value:
@@ -116,7 +116,7 @@ def table_faults(
             found += _value(
                 value[name], field.type, (*path, name), f"left out: {shown(field.default)}" if plain else ""
             )
-        elif field.required and name not in meant:
+        elif field.required and name not in guessed:
             _, note = _plain(field.type, "")
             hint = _REMEDY.get(name) or f"add {name} = ... ({note})"
             found.append(Fault(path, f"'{name}' is missing{_place_in_file(path)}", hint))

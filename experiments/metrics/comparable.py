@@ -36,23 +36,23 @@ def reasons(case: CaseMetrics) -> tuple[str, ...]:
         found.append(f"{', '.join(stalled)} missed {100.0 * STALLED:g} % of its deadlines or more")
     if lost >= LOST:
         found.append(f"{100.0 * lost:.2g} % of the poses were lost")
-    told = [each for each in case.troubles if BY_OPERATOR in each or STOOD in each]
-    if any(spoils(each) for each in case.troubles if each not in told):
+    named = [each for each in case.troubles if BY_OPERATOR in each or STOOD in each]
+    if any(spoils(each) for each in case.troubles if each not in named):
         found.append("robots did not begin together, or messages could not be read")
-    found += told
+    found += named
     if factor is not None and factor < SLOW:
         found.append(f"the world ran at {factor:.2f} of real time")
     return tuple(found)
 
 
-def with_failures(case: CaseMetrics, told: Iterable[str]) -> CaseMetrics:
+def with_failures(case: CaseMetrics, failures: Iterable[str]) -> CaseMetrics:
     """A case with failures that its recording misses: its conductor saw them after the end of its recorder.
 
     Failures of robots that have failed by the recording already are left out.
     """
     failed = {text.split(" ")[0].rstrip(":") for text in case.failures}
     names = {robot.robot for robot in case.robots}
-    more = [text for text in told if not (named := names & {*re.split(r"[\s,:]+", text)}) or named - failed]
+    more = [text for text in failures if not (named := names & {*re.split(r"[\s,:]+", text)}) or named - failed]
     if not more:
         return case
     case = msgspec.structs.replace(case, failures=(*case.failures, *more))

@@ -249,10 +249,10 @@ def _covered_s(spans: Iterable[tuple[float, float, Cause]]) -> float:
 
 def _restarted(trace: Trace) -> list[str]:
     """Routers, worlds and the like that ended in the run and were started again, one sentence each."""
-    told = (each for each in trace.events if each.source == "conductor" and each.kind != "recorder")
+    events = (each for each in trace.events if each.source == "conductor" and each.kind != "recorder")
     return [
         f"{event.text.partition('; ')[0]} after {event.stamp:.1f} s, and was started again"
-        for event in told
+        for event in events
         if "; started again" in event.text and 0.0 <= event.stamp <= trace.time[-1]
     ]
 
@@ -262,8 +262,8 @@ def _redirected(trace: Trace) -> list[str]:
     found: dict[str, str] = {}
     for event in trace.events:
         if event.kind == "hazard" and event.text.startswith("warn: ") and event.text.endswith(BY_OPERATOR):
-            told = f"{event.source} {event.text.removeprefix('warn: ')} at {max(event.stamp, 0.0):.1f} s"
-            found.setdefault(event.source, told)
+            sentence = f"{event.source} {event.text.removeprefix('warn: ')} at {max(event.stamp, 0.0):.1f} s"
+            found.setdefault(event.source, sentence)
     return [*found.values()]
 
 

@@ -41,28 +41,28 @@ def agreement(trace: Trace) -> list[ShadowMetrics | None]:
     known = np.isfinite(difference).all(axis=2) & np.isfinite(turned)
     found: list[ShadowMetrics | None] = []
     for i, name in enumerate(trace.robots):
-        mine = known[:, i]
+        samples = known[:, i]
         chosen = trace.plan.experiment.robots[name].shadow
-        if not mine.any():
+        if not samples.any():
             found.append(None)
             continue
         robot, twin = trace.position[:, i], trace.shadow_position[:, i]
         apart = difference[:, i]
-        bias = apart[mine].mean(axis=0).tolist()
-        gap = norm(apart[mine])
+        bias = apart[samples].mean(axis=0).tolist()
+        gap = norm(apart[samples])
         found.append(
             ShadowMetrics(
                 horizon_s=None if chosen is None else chosen.restart_s,
                 bias=(bias[0], bias[1], bias[2]),
-                along=float(along[mine, i].mean()),
-                across=float(across[mine, i].mean()),
-                bias_yaw=float(turned[mine, i].mean()),
+                along=float(along[samples, i].mean()),
+                across=float(across[samples, i].mean()),
+                bias_yaw=float(turned[samples, i].mean()),
                 rmse=float(np.sqrt((gap**2).mean())),
-                rmse_yaw=float(np.sqrt((turned[mine, i] ** 2).mean())),
+                rmse_yaw=float(np.sqrt((turned[samples, i] ** 2).mean())),
                 largest=float(gap.max()),
-                correlation=tuple(_correlation(robot[mine, k], twin[mine, k], STILL_M) for k in range(3)),  # type: ignore[arg-type]
-                correlation_speed=_of_speeds(trace.time, robot, twin, mine),
-                known=float(mine.mean()),
+                correlation=tuple(_correlation(robot[samples, k], twin[samples, k], STILL_M) for k in range(3)),  # type: ignore[arg-type]
+                correlation_speed=_of_speeds(trace.time, robot, twin, samples),
+                known=float(samples.mean()),
             )
         )
     return found

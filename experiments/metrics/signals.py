@@ -130,8 +130,8 @@ class LinkErrors:
         """Per robot the mean error of its worst link [m], and the robot at its other end."""
         mean = mean_known(self.error)
         found: list[tuple[float | None, str]] = []
-        for i, mine in enumerate(self.own.T > 0.0):
-            candidates = np.flatnonzero(mine & np.isfinite(mean))
+        for i, counts in enumerate(self.own.T > 0.0):
+            candidates = np.flatnonzero(counts & np.isfinite(mean))
             if not len(candidates):
                 found.append((None, ""))
                 continue
@@ -237,13 +237,13 @@ def belief_errors(trace: Trace, net: Links) -> Array:
     order = np.argsort(link, kind="stable")
     ends = np.searchsorted(link[order], np.arange(len(net) + 1))
     for k, (begin, end) in enumerate(pairwise(ends)):
-        mine = order[begin:end]
-        stamp = received.stamp[mine]
-        mine = mine[stamp >= np.maximum.accumulate(stamp)]  # overtaken samples are ignored
-        if not len(mine):
+        arrivals = order[begin:end]
+        stamp = received.stamp[arrivals]
+        arrivals = arrivals[stamp >= np.maximum.accumulate(stamp)]  # overtaken samples are ignored
+        if not len(arrivals):
             continue
-        at = np.searchsorted(received.arrival[mine], trace.time, side="right") - 1
-        newest = mine[at]
+        at = np.searchsorted(received.arrival[arrivals], trace.time, side="right") - 1
+        newest = arrivals[at]
         age = np.maximum(trace.time - received.stamp[newest], 0.0)
         believed = _predicted(trace.plan.predictor, received.position[newest], received.velocity[newest], age)
         error[:, k] = norm(believed - trace.true_position[:, net.sender[k]])

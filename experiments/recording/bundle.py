@@ -150,26 +150,26 @@ def differences(repeated: Path, former: Path) -> list[str]:
     """Differences between the results of two folders of one run in virtual time, to the last bit; empty if nothing."""
     found = []
     try:
-        mine, theirs = (json.loads((folder / METRICS).read_bytes()) for folder in (repeated, former))
+        repeat, original = (json.loads((folder / METRICS).read_bytes()) for folder in (repeated, former))
     except (OSError, ValueError, RecursionError) as error:
         raise RecordingError(f"{METRICS} cannot be compared: {error}") from None
-    if mine != theirs:
-        old, new = dict(flattened(theirs)), dict(flattened(mine))
+    if repeat != original:
+        old, new = dict(flattened(original)), dict(flattened(repeat))
         changed = [path for path in sorted(old.keys() | new.keys()) if old.get(path) != new.get(path)]
         found.append("figures: " + ", ".join(f"{path} {old.get(path)} → {new.get(path)}" for path in changed[:5]))
     if (repeated / TABLE).exists() and not _same(repeated / TABLE, former / TABLE):
         found.append(f"{TABLE}: another table")
     for name in sorted({file.name for folder in (repeated, former) for file in folder.glob("*.mcap")}):
-        mine, theirs = repeated / name, former / name
-        if not (mine.exists() and theirs.exists()):
-            found.append(f"{name} is missing {'in the bundle' if mine.exists() else 'in the repeated run'}")
-        elif _messages(mine) != _messages(theirs):
+        repeat, original = repeated / name, former / name
+        if not (repeat.exists() and original.exists()):
+            found.append(f"{name} is missing {'in the bundle' if repeat.exists() else 'in the repeated run'}")
+        elif _messages(repeat) != _messages(original):
             found.append(f"{name}: other messages")
     return found
 
 
-def _same(mine: Path, theirs: Path) -> bool:
-    return theirs.is_file() and mine.read_bytes() == theirs.read_bytes()
+def _same(file: Path, other: Path) -> bool:
+    return other.is_file() and file.read_bytes() == other.read_bytes()
 
 
 def _messages(file: Path) -> str:

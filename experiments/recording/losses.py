@@ -46,9 +46,9 @@ def count_lost(
     total: Counter[str] = Counter()
     begin, end = run[0] - ROUNDING_S, run[1] + ROUNDING_S
     for robot, own, reports in zip(robots, poses, statuses, strict=True):
-        mine = [(pose.stamp, pose.seq) for pose in own if begin <= pose.stamp <= end]
+        numbered = [(pose.stamp, pose.seq) for pose in own if begin <= pose.stamp <= end]
         tails = sum(_tail(own, life, run, rate) for life in lives(reports, _made))
-        total[robot] += count_unrecorded(mine, rate) + tails
+        total[robot] += count_unrecorded(numbered, rate) + tails
         total.update(_by_sender(reports, run, "lost"))
     return np.array([total[robot] for robot in robots], dtype=np.intp)
 

@@ -315,7 +315,7 @@ def _trace(content: Content, about: AboutRun, run: tuple[float, float], time: Ar
     columns = {what: np.stack([own[what] for own in sampled], axis=1) for what in sampled[0]}
     known = {what: each for what, each in columns.items() if what not in OPTIONAL or np.isfinite(each).any()}
     contacts, world = world_in_run(content[Contact], content[WorldState], start, duration)
-    told, stepping = by_robot(content[LawMemory], robots), HOLD_PERIODS / min(rate, experiment.rates.coordination_hz)
+    laws, stepping = by_robot(content[LawMemory], robots), HOLD_PERIODS / min(rate, experiment.rates.coordination_hz)
     goals = _goals(content, states, robots, start, duration) if plan.guided else None
     return Trace(
         case=about.case,
@@ -343,8 +343,8 @@ def _trace(content: Content, about: AboutRun, run: tuple[float, float], time: Ar
         goals=goals,
         clocks=Correction(content[HostClock]).offsets(),
         joined=_joined(states, plan, start),
-        memory=_memories(told, start, time, stepping, "memory"),
-        measures={name: values[..., 0] for name, values in _memories(told, start, time, stepping, "measures").items()},
+        memory=_memories(laws, start, time, stepping, "memory"),
+        measures={name: values[..., 0] for name, values in _memories(laws, start, time, stepping, "measures").items()},
         **known,
     )
 
@@ -416,14 +416,14 @@ def _sampled(states: list[State], start: float, time: Array, hold: float) -> dic
 
 
 def _memories(
-    told: list[list[LawMemory]], start: float, time: Array, hold: float, what: Literal["memory", "measures"]
+    laws: list[list[LawMemory]], start: float, time: Array, hold: float, what: Literal["memory", "measures"]
 ) -> dict[str, Array]:
     """Variables of all robots on the grid `time` (T,), by name: (T, N, k); NaN where one is unknown."""
     sizes: dict[str, int] = {}
-    for each in (each for own in told for message in own for each in getattr(message, what)):
+    for each in (each for own in laws for message in own for each in getattr(message, what)):
         sizes[each.name] = max(sizes.get(each.name, 1), len(each.value))
-    found = {name: np.full((len(time), len(told), size), np.nan) for name, size in sizes.items()}
-    for row, own in enumerate(told):
+    found = {name: np.full((len(time), len(laws), size), np.nan) for name, size in sizes.items()}
+    for row, own in enumerate(laws):
         t = np.array([message.stamp for message in own]) - start
         for name, size in sizes.items():
             known = [_value(getattr(message, what), name, size) for message in own]

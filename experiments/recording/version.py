@@ -73,12 +73,12 @@ class Provenance(msgspec.Struct, frozen=True, omit_defaults=True):
         found = []
         if self.code != other.code:
             found.append(f"code {self.code[:DIGEST_CHARACTERS]}, not {other.code[:DIGEST_CHARACTERS]}")
-        mine, theirs = ({"Python": each.python, **each.packages, **each.plugins} for each in (self, other))
-        shared = sorted(mine.keys() & theirs.keys())
-        found += [f"{name} {mine[name]}, not {theirs[name]}" for name in shared if mine[name] != theirs[name]]
-        found += [f"plug-ins of {name} {mine[name]}, the other without" for name in sorted({*self.plugins} - {*theirs})]
-        lacking = sorted({*other.plugins} - {*mine})
-        return found + [f"no plug-ins of {name}, the other with version {theirs[name]}" for name in lacking]
+        left, right = ({"Python": each.python, **each.packages, **each.plugins} for each in (self, other))
+        shared = sorted(left.keys() & right.keys())
+        found += [f"{name} {left[name]}, not {right[name]}" for name in shared if left[name] != right[name]]
+        found += [f"plug-ins of {name} {left[name]}, the other without" for name in sorted({*self.plugins} - {*right})]
+        lacking = sorted({*other.plugins} - {*left})
+        return found + [f"no plug-ins of {name}, the other with version {right[name]}" for name in lacking]
 
 
 @cache

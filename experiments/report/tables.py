@@ -264,9 +264,9 @@ def _table_by_row(
     for item in every:
         found.setdefault(name(item), []).append(item)
     rows = [
-        TableRow((what, *(cell(mine) for _, cell in columns)), sum=group is sums)
+        TableRow((what, *(cell(members) for _, cell in columns)), sum=group is sums)
         for group in (found, sums or {})
-        for what, mine in group.items()
+        for what, members in group.items()
     ]
     return Table((head, *(column for column, _ in columns)), tuple(rows), title=case)
 

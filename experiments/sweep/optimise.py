@@ -205,12 +205,12 @@ def tune(
         notes = store.changed_since(origin(read, [read.cases()[name] for name in (reference, *ranges)]))
         with workers(scheduler, processes) as working:
             runner = SweepRunner(store, working)
-            for name, mine in ranges.items():
-                rows = search.run(cma, runner, name, mine, progress)
+            for name, bounds in ranges.items():
+                rows = search.run(cma, runner, name, bounds, progress)
                 tried += rows
-                best = search.choose(runner, rows, mine)
+                best = search.choose(runner, rows, bounds)
                 selected.append(best)
-                for cell in search.again(best, mine):
+                for cell in search.again(best, bounds):
                     plan.setdefault((cell.case, cell.digest), cell)
             final = sorted(plan.values(), key=lambda cell: cell.case != reference)
             runner.run_missing(final, seeds)

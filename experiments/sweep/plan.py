@@ -174,9 +174,9 @@ def combination(
         *((name, changed[name], values) for name in names),
     ):
         own = [axis for axis in given if _has(name, plan, paths[axis])]
-        mine = {axis.path: paths[axis].value for axis in own}
+        chosen_values = {axis.path: paths[axis].value for axis in own}
         met = {axis.path: paths[axis].value for axis in own if axis in shared or paths[axis].path[0] in ENVIRONMENT}
-        yield Cell(name, mine, plan, reference, digest(plan), met)
+        yield Cell(name, chosen_values, plan, reference, digest(plan), met)
 
 
 def _changed(file: str, settings: Sequence[str], values: Mapping[Axis, str]) -> dict[str, Plan]:

@@ -82,11 +82,11 @@ def fly(case: bytes, seeds: Sequence[int], code: str, plain_s: float = 0.0) -> b
     """
     try:
         plan = Plan.decoded(case)
-        mine = code_of(plan)
+        local = code_of(plan)
     except (msgspec.ValidationError, registry.PluginError) as error:  # another version made it, or a plug-in is missing
         return msgspec.json.encode(WorkResult([], stranger=str(error)))
-    if mine != code:
-        return msgspec.json.encode(WorkResult([], stranger=f"{mine}, not {code}"))
+    if local != code:
+        return msgspec.json.encode(WorkResult([], stranger=f"{local}, not {code}"))
     stretch.expect(plain_s)
     runs, failed = fly_seeds(without_standby(plan), tuple(seeds))
     failed |= {run.seed: run.failure for run in runs if run.failure}

@@ -175,10 +175,10 @@ class SweepRunner:
         by_digest, metrics = {cell.digest: cell for cell in plan}, self.metrics(plan, seeds)
         found = []
         for cell in plan:
-            known, mine = self._known(cell, seeds), self._runs(cell, seeds)
+            known, runs = self._known(cell, seeds), self._runs(cell, seeds)
             if known:
                 reference = self._runs(by_digest[cell.reference], seeds)
-                found.append(table.row(cell, mine, reference, len(known) - len(mine), metrics))
+                found.append(table.row(cell, runs, reference, len(known) - len(runs), metrics))
         return found
 
     def metrics(self, plan: Sequence[Cell], seeds: Sequence[int]) -> dict[str, Metric]:

@@ -72,23 +72,23 @@ def row(
 ) -> CellRow:
     """A cell's runs, by seed, and those of its reference; some `metrics` instead of those of all sweeps."""
     metrics = swept_metrics() if metrics is None else metrics
-    mine = [runs[seed] for seed in sorted(runs)]
+    ordered = [runs[seed] for seed in sorted(runs)]
     paired = [
         (runs[seed], reference[seed])
         for seed in sorted(runs)
         if seed in reference and equally_long((runs[seed].duration_s, reference[seed].duration_s))
     ]
-    acquired = [run.values["acquired_s"] is not None for run in mine]
-    gaps = [run.gap_min_s for run in mine if run.gap_min_s is not None]
+    acquired = [run.values["acquired_s"] is not None for run in ordered]
+    gaps = [run.gap_min_s for run in ordered if run.gap_min_s is not None]
     return CellRow(
         case=cell.case,
         parameters=dict(cell.parameters),
         environment=dict(cell.environment),
         units={path: unit for path in cell.parameters if 0 < len(unit := reference_of_file.unit(path)) <= SHORT},
         reference=cell.digest == cell.reference,
-        seeds=len(mine),
+        seeds=len(ordered),
         failed=failed,
-        mean={name: spread([run.values.get(name) for run in mine]) for name in metrics},
+        mean={name: spread([run.values.get(name) for run in ordered]) for name in metrics},
         ratio={
             name: spread([ratio(one.values.get(name), other.values.get(name)) for one, other in paired])
             for name in relative_metrics(metrics)
@@ -216,15 +216,15 @@ def parameter_columns(rows: Sequence[CellRow]) -> dict[str, list[str]]:
     for path in dict.fromkeys(path for row in most_first for path in row.parameters):
         paths.setdefault(short(path), []).append(path)
     columns: dict[str, list[str]] = {}
-    for head, mine in paths.items():
-        alone = all(len(row.parameters.keys() & set(mine)) < 2 for row in rows)
-        columns |= {head: mine} if alone else {path: [path] for path in mine}
+    for head, group in paths.items():
+        alone = all(len(row.parameters.keys() & set(group)) < 2 for row in rows)
+        columns |= {head: group} if alone else {path: [path] for path in group}
     units = {path: unit for row in rows for path, unit in row.units.items()}
     return {
-        f"{head} [{units[mine[0]]}]" if mine[0] in units else head: [
-            next((words_of(row.parameters[path]) for path in mine if path in row.parameters), NONE) for row in rows
+        f"{head} [{units[group[0]]}]" if group[0] in units else head: [
+            next((words_of(row.parameters[path]) for path in group if path in row.parameters), NONE) for row in rows
         ]
-        for head, mine in columns.items()
+        for head, group in columns.items()
     }
 
 

@@ -66,7 +66,7 @@ class Broadcast:
         Raises ExplainedError if a run or a robot is up in the realm, before or while it plays.
         """
         keys, names = self.keys, [self.keys.alive(name) for name in self.plan.names]
-        began, mine = Clock().utc(), str(self._session.zid())
+        began, zid = Clock().utc(), str(self._session.zid())
         owners = Keys.life(keys.alive("*"), "*")
         watched = (keys.conductor, keys.alive("*"), owners, keys.world_alive)
         watches = [pubsub.AliveWatch(self._session, key) for key in watched]
@@ -74,7 +74,7 @@ class Broadcast:
 
         def refuse_strangers(own: Sequence[str] = ()) -> None:
             found = {token for watch in watches for token, there in watch.changes() if there}
-            if strangers := {token for token in found if token not in own and Keys.life_of(token) != mine}:
+            if strangers := {token for token in found if token not in own and Keys.life_of(token) != zid}:
                 raise ExplainedError(_occupied(keys, strangers))
 
         until = time.monotonic() + self._watch_s

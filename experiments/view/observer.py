@@ -224,10 +224,10 @@ class Observer:
     @property
     def phase(self) -> str:
         """Phase of the case by the conductor's last words, else by the clock; empty before the start."""
-        told = next((event.text for event in reversed(self.events) if event.kind == "phase"), "")
+        last = next((event.text for event in reversed(self.events) if event.kind == "phase"), "")
         elapsed, plan = self.elapsed, self.stage.plan
-        if told or elapsed is None or plan is None:
-            return told
+        if last or elapsed is None or plan is None:
+            return last
         return next((name for at, name in reversed(plan.experiment.phases) if elapsed >= at), "")
 
     def now(self) -> float:

@@ -89,8 +89,8 @@ def _print_fitting(analysed: Mapping[str, Analysis]) -> None:
             continue
         print(f"\n[{'formation.links' if not printed else f'cases.{case}.formation.links'}]")
         for text, link in links.items():
-            told = to_builtins(link)
-            print(f"{written(text)} = {written(told['distance'] if set(told) == {'distance'} else told)}")
+            target = to_builtins(link)
+            print(f"{written(text)} = {written(target['distance'] if set(target) == {'distance'} else target)}")
         printed.append(links)
 
 

@@ -79,10 +79,10 @@ def explain(
     print(*(f"  {name:8} {text}" for name, text in rows.items() if text), sep="\n")
     print(textwrap.indent(f"\n{found[0].example}", "    "))
     rest = [entry for entry in found if entry not in alike]
-    told = {(entry.key.removeprefix(alike[0].key), entry.text) for entry in rest if entry.key.startswith(alike[0].key)}
+    known = {(entry.key.removeprefix(alike[0].key), entry.text) for entry in rest if entry.key.startswith(alike[0].key)}
     for other in alike[1:]:  # a plug-in in another place has the same parameters
         again = f"{other.key}."
-        rest = [e for e in rest if not e.key.startswith(again) or (e.key.removeprefix(other.key), e.text) not in told]
+        rest = [e for e in rest if not e.key.startswith(again) or (e.key.removeprefix(other.key), e.text) not in known]
     if rest:
         print()
     _print_entries(rest)

@@ -133,8 +133,8 @@ def _members(given: list[str]) -> tuple[dict[str, None], dict[str, list[str]]]:
             for case in document.read(each).cases().values():
                 robots |= dict.fromkeys(case.names)
                 listening |= mesh.listening_hosts(case)
-        elif meant := get_close_matches(each, names, n=1, cutoff=0.8):
-            raise LabError(f"{each} is neither a file nor in the catalogue; did you mean '{meant[0]}'?")
+        elif near := get_close_matches(each, names, n=1, cutoff=0.8):
+            raise LabError(f"{each} is neither a file nor in the catalogue; did you mean '{near[0]}'?")
         else:
             robots[each] = None
     return robots, listening

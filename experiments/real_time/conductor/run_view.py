@@ -298,5 +298,5 @@ def _fell_out(before: messages.Status | None, now: messages.Status) -> bool:
     """
     if before is None or before.pid != now.pid or before.phase not in ("ready", "airborne", "running"):
         return False
-    told = any(incident.text.startswith(("land: ", "cut: ")) for incident in now.incidents)
-    return now.phase in ("landing", "done") and not (told or now.reason.startswith(ASKED))
+    reported = any(incident.text.startswith(("land: ", "cut: ")) for incident in now.incidents)
+    return now.phase in ("landing", "done") and not (reported or now.reason.startswith(ASKED))
