@@ -245,8 +245,8 @@ class Observer:
     def condition(self, name: str) -> Condition:
         """Condition of a robot."""
         report, touches = self.robots[name], any(name in pair for pair in self._touching)
-        silent, alive = time.monotonic() - report.heard_at > SILENT_S, report.alive or not report.known
-        return condition(report.status, alive=alive, silent=silent, touches=touches)
+        silent = report.status is not None and time.monotonic() - report.heard_at > SILENT_S
+        return condition(report.status, alive=report.alive or not report.known, silent=silent, touches=touches)
 
     def moment(self) -> Moment:
         now, stage = time.monotonic(), self.stage

@@ -95,6 +95,9 @@ def test_table_page_and_conductor_say_the_same():
             assert (f">{row.phase}</span>" in page) == (known != Condition.ACTIVE)
             words[known] = row.phase
             seen.add(known)
+        observer.robots["new"] = RobotReport()
+        assert observer.condition("new") == RobotView().condition(0.0) == Condition.WAITING
+        assert robot_row("new", Condition.WAITING, None, None).phase == "starting"
     assert {*Condition} - seen == {Condition.ABSENT, Condition.TOUCHING}
     assert all(words[each] == word for each, (word, _) in CONDITIONS.items() if word and each in seen)
     assert all(f" {CONDITIONS[each][0]}<" in legend() for each in Condition if each >= Condition.LANDING)
