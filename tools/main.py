@@ -42,6 +42,7 @@ app.add_typer(lab.app, name="lab")
 app.add_typer(orders.robot_app, name="robot")
 app.add_typer(hosts.turtlebot_app, name="turtlebot")
 app.add_typer(orders.world_app, name="world")
+app.add_typer(processes.cameras_app, name="cameras")
 
 # what `./zenpark` itself does, before Python's packages are there
 LAUNCHER: Final = {

@@ -33,7 +33,7 @@ PANELS: Final = {
     "Watch": "view top runs keys echo",
     "Act": "robot world estop",
     "By hand": "router agent centre twin bridge",
-    "Lab": "preflight hosts lab turtlebot",
+    "Lab": "preflight hosts lab cameras turtlebot",
     "Set-up": "install hardware docs test",
 }
 

@@ -41,9 +41,14 @@ class CaptureReader(ABC):
     """Connection to a motion capture system, which streams every frame. Another one is made after each error."""
 
     PORT: ClassVar[int]  # usual port of the server
+    FILE: ClassVar[bool] = False  # the address is the name of a file beside the experiment, not a host
     UP: ClassVar[str] = "z"  # axis that points up where neither the stream nor the file says so
     PROGRAM: ClassVar[str] = "motion capture"  # program that is to run on the host, for messages
     TRANSPORT: ClassVar[str] = "TCP"  # protocol that a firewall must let in, for messages
+    HINT: ClassVar[str] = (  # remedy where nothing answers
+        "Is that the computer that runs {program}, is it on this network (ping {host}), and does its firewall let "
+        "{transport} port {port} in?"
+    )
     TWIN: ClassVar[str] = ""  # protocol twin, as `module:class`, for `positioning = "NAME-twin"`
 
     @abstractmethod
@@ -64,6 +69,19 @@ class CaptureReader(ABC):
     @abstractmethod
     def close(self) -> None:
         """Leave the system."""
+
+    @classmethod
+    def parse(cls, address: str) -> tuple[str, int]:
+        """Host and port of an address; raises ValueError for one that is none."""
+        return parse_server(address, cls.PORT)
+
+    @classmethod  # noqa: B027 - a host has no text
+    def check(cls, text: str, label: str, flies: Mapping[str, bool]) -> None:
+        """Check the text of a file that is the address; raises ValueError with place and remedy.
+
+        Args:
+            flies: Whether a body is that of a robot that flies, by name.
+        """
 
 
 def parse_server(server: str, port: int) -> tuple[str, int]:

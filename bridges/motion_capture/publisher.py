@@ -16,7 +16,7 @@ import msgspec
 from msgspec import Meta
 
 from agents.body.byte_stream import MalformedStream
-from agents.body.capture_reader import CaptureFrame, CaptureReader, MeasuredPose, parse_server
+from agents.body.capture_reader import CaptureFrame, CaptureReader, MeasuredPose
 from agents.body.coordinates import Coordinates
 from agents.body.external_pose import External
 from agents.clock import Clock, uptime
@@ -176,6 +176,7 @@ class Bridge:
     ) -> None:
         """Connect to `host` and `port` with `connect`; `latency_s` is added to the latency that frames say [s]."""
         self._host, self._port = host, port
+        self._name = address(host, port)
         self._filter, self._publish, self._print_line = pose_filter, publish, print_line
         self._connect, self._latency, self._pause_s = connect, latency_s, pause_s
         self._clock = Clock()
@@ -193,15 +194,15 @@ class Bridge:
             try:
                 reader = self._connect(self._host, self._port, ATTEMPT_S if ever else min(ATTEMPT_S, max(0.1, left)))
             except (OSError, MalformedStream) as error:
-                self._report_once(f"no connection to {self._host}:{self._port}: {describe_error(error)}; trying again")
+                self._report_once(f"no connection to {self._name}: {describe_error(error)}; trying again")
                 pause.wait(self._pause_s)
                 continue
             ever = True
-            self._report_once(f"connected to {self._host}:{self._port}")
+            self._report_once(f"connected to {self._name}")
             try:
                 self._pump(reader, over)
             except (OSError, MalformedStream) as error:
-                self._report_once(f"lost {self._host}:{self._port}: {describe_error(error)}; trying again")
+                self._report_once(f"lost {self._name}: {describe_error(error)}; trying again")
             finally:
                 reader.close()
             pause.wait(self._pause_s)
@@ -263,6 +264,11 @@ class StreamFigures:
         self._frames, self._sum = 0, 0.0
 
 
+def address(host: str, port: int) -> str:
+    """Host and port for messages; a file has no port."""
+    return f"{host}:{port}" if port else host
+
+
 def describe_error(error: OSError | MalformedStream) -> str:
     """Text of an error, without the operating system's numbers."""
     return error.strerror if isinstance(error, OSError) and error.strerror else str(error)
@@ -271,8 +277,10 @@ def describe_error(error: OSError | MalformedStream) -> str:
 class PositioningLaunch(NetworkLaunch, frozen=True, kw_only=True, rename="kebab"):
     """Positions from motion capture for robots."""
 
-    system: Annotated[str, Meta(title="SYSTEM", description="vicon, optitrack, qualisys, or that of a plug-in")]
-    server: Annotated[str, Meta(title="HOST[:PORT]", description="where the program of the system runs")]
+    system: Annotated[str, Meta(title="SYSTEM", description="vicon, optitrack, qualisys, cameras, one of a plug-in")]
+    server: Annotated[
+        str, Meta(title="HOST[:PORT]", description="where the program of the system runs; of cameras, their file")
+    ]
     map: Annotated[
         list[str], Meta(title="ROBOT[=BODY]", description="a robot, and its body in the system; may be repeated")
     ] = msgspec.field(default_factory=list)
@@ -294,7 +302,7 @@ class PositioningLaunch(NetworkLaunch, frozen=True, kw_only=True, rename="kebab"
 def serve(launch: PositioningLaunch) -> int:
     """Run the bridge until a signal, or until its lifeline is lost and the robots are gone; returns the exit code."""
     system = registry.load(registry.POSITIONING, launch.system)
-    host, port = parse_server(launch.server, system.PORT)
+    host, port = system.parse(launch.server)
     subjects = parse_maps(launch.map)
     coordinates = Coordinates.parse(launch.up, launch.unit, launch.origin, launch.heading)
     stop, lost = threading.Event(), threading.Event()
@@ -325,10 +333,8 @@ def serve(launch: PositioningLaunch) -> int:
         declared += [farewell, made]
         if made.run(lambda: stop.is_set() or farewell.over()):
             return 0
-    print_line(
-        f"no answer from {host}:{port} in {FIRST_S:g} s. Is that the computer that runs {system.PROGRAM}, is it on "
-        f"this network (ping {host}), and does its firewall let {system.TRANSPORT} port {port} in?"
-    )
+    hint = system.HINT.format(program=system.PROGRAM, host=host, transport=system.TRANSPORT, port=port)
+    print_line(f"no answer from {address(host, port)} in {FIRST_S:g} s. {hint}")
     return 2
 
 

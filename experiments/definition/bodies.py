@@ -220,6 +220,10 @@ def behind_protocols(plan: Plan) -> Plan:
 
 def simulated_capture(capture: Positioning | None) -> str | Positioning:
     """The protocol twin of a motion capture system, with its names and coordinates; a Vicon's where there is none."""
-    if capture is None or not registry.load(registry.POSITIONING, capture.system).TWIN:
+    if capture is None:
         return VICON_TWIN
-    return msgspec.structs.replace(capture, source=f"{capture.system}{TWIN}")
+    reader = registry.load(registry.POSITIONING, capture.system)
+    if not reader.TWIN:
+        return VICON_TWIN
+    file = f"://{capture.address}" if reader.FILE else ""
+    return msgspec.structs.replace(capture, source=f"{capture.system}{TWIN}{file}")

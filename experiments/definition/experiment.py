@@ -354,7 +354,10 @@ class Hybrid(FileTable, frozen=True):
 class Positioning(Coordinates, frozen=True):
     """Motion capture that measures the robots with `position = "external"`."""
 
-    source: Annotated[str, doc("vicon, optitrack or qualisys, as SYSTEM://HOST[:PORT], or simulated, as SYSTEM-twin")]
+    source: Annotated[
+        str,
+        doc("vicon, optitrack or qualisys, as SYSTEM://HOST[:PORT], or cameras://FILE; simulated: SYSTEM-twin"),
+    ]
     names: Annotated[
         dict[Name, Annotated[str, Meta(min_length=1)]],
         doc("bodies in the system by robot, where they have other names"),
@@ -364,12 +367,22 @@ class Positioning(Coordinates, frozen=True):
     @property
     def system(self) -> str:
         """Name of the system, such as "vicon"."""
-        return self.source.partition("://")[0].removesuffix(TWIN)
+        return self.scheme.removesuffix(TWIN)
+
+    @property
+    def scheme(self) -> str:
+        """Word of the source, such as "vicon" or "vicon-twin"."""
+        return self.source.partition("://")[0]
 
     @property
     def simulated(self) -> bool:
         """Whether the system is a protocol twin."""
-        return self.source.endswith(TWIN)
+        return self.scheme.endswith(TWIN)
+
+    @property
+    def address(self) -> str:
+        """Host or file of the system; empty for a twin without a file."""
+        return self.source.partition("://")[2]
 
 
 # metrics of zenpark that a criterion can name; those of other distributions come beside them

@@ -30,7 +30,7 @@ def member_endpoints(cases: Iterable[Plan], *, secure: bool) -> list[str]:
             given = next((case.network.addresses[name] for name in group if name in case.network.addresses), "")
             found.setdefault(topology.TOGETHER.join(group), given)
         services += ["world"] * access_rights.has_world(plan) + ["centre"] * bool(plan.guided)
-        services += [case.capture.source] if case.capture and case.capture.simulated else []
+        services += [case.capture.scheme] if case.capture and case.capture.simulated else []
     services = [*dict.fromkeys(services), "conductor"]
     taken = set(found.values())
     for name in (*found, *services):

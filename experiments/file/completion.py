@@ -14,7 +14,7 @@ from agents.errors import did_you_mean
 from agents.plugins import registry
 from agents.plugins.law import Law
 from experiments.catalogue import index
-from experiments.definition.experiment import TARGETS, Formation
+from experiments.definition.experiment import TARGETS, Experiment, Formation
 from experiments.definition.links import TARGET_KINDS, link_pairs, pairs_or_none
 from experiments.file.choices import group_of, struct_of
 from experiments.file.overrides import SHAPE
@@ -99,6 +99,34 @@ def fill_from_files(document: dict[str, Any], folder: pathlib.Path) -> tuple[lis
                 contents[name] = found
                 choice[content] = b64encode(found).decode()
     return faults, contents
+
+
+def capture_file(
+    experiment: Experiment, folder: pathlib.Path, *, missing: bool
+) -> tuple[list[Fault], dict[str, bytes]]:
+    """Faults of the file of a system that measures positions, and its content by its name.
+
+    Args:
+        missing: Whether a file that is not there is a fault; processes of a run get its place.
+    """
+    capture = experiment.capture
+    if capture is None or capture.system not in registry.names(registry.POSITIONING):
+        return [], {}
+    reader = registry.load(registry.POSITIONING, capture.system)
+    if not reader.FILE or not capture.address:
+        return [], {}
+    path: Path = ("positioning",) if isinstance(experiment.positioning, str) else ("positioning", "source")
+    content = content_of(capture.address, folder, path, missing=missing)
+    if not isinstance(content, bytes):
+        return [content] if content else [], {}
+    measured = {name: robot for name, robot in experiment.robots.items() if robot.position == "external"}
+    flies = {capture.names.get(name, name): robot.hover is not None for name, robot in measured.items()}
+    try:
+        reader.check(content.decode(errors="replace"), capture.address, flies)
+    except ValueError as error:
+        message, _, remedy = str(error).partition("; ")
+        return [Fault(path, message, remedy)], {}
+    return [], {capture.address: content}
 
 
 def content_of(name: str, folder: pathlib.Path, path: Path, *, missing: bool = True) -> bytes | Fault | None:

@@ -27,7 +27,7 @@ from experiments.definition.plan import Plan
 from experiments.file import catalogue, structure
 from experiments.file.cases import Source, each_once, resolve
 from experiments.file.choices import Adopted, tables
-from experiments.file.completion import fill_from_files, fill_from_shape, law_of
+from experiments.file.completion import capture_file, fill_from_files, fill_from_shape, law_of
 from experiments.file.consistency.robots import device_faults
 from experiments.file.consistency.whole import consistency_faults, criteria_faults
 from experiments.file.graphs.links import fill_from_graph
@@ -170,6 +170,9 @@ def _document(file: Path, label: str, text: str, flags: Sequence[str], *, receiv
         if not received:  # its devices were looked at already; a robot needs none of the others' bodies
             for name, plan in plans.items():
                 found[name] += device_faults(plan.experiment)
+                wrong, contents = capture_file(plan.experiment, file.parent, missing=not is_json)
+                found[name] += wrong
+                beside |= contents
         source.refuse([*criteria, *each_once(found, tables)])
     except RecursionError:
         raise refusal(label, "tables or lists are nested too deeply", "flatten them") from None

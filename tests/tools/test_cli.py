@@ -19,7 +19,7 @@ COMMANDS = sorted(typer.main.get_command(app).commands)
 
 def test_every_command_has_help():
     words = """
-    agent bridge centre check clean course docs echo estop explain export hardware hosts import install keys lab
+    agent bridge cameras centre check clean course docs echo estop explain export hardware hosts import install keys lab
     list mark new preflight report robot router run runs station sweep test top turtlebot
     twin view world
     """

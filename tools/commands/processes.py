@@ -26,6 +26,7 @@ from tools.options import (
     Lifeline,
     Realm,
     example,
+    group,
     plain,
     routers,
     with_options,
@@ -37,6 +38,9 @@ if TYPE_CHECKING:
 
 L = TypeVar("L", bound="Launch")
 app: Final = typer.Typer()
+cameras_app: Final = group("Prepare cameras that see tags on robots.")
+CAMERAS: Final = "bridges.motion_capture.cameras.reader"
+Cameras = Annotated[Path, Argument(metavar="FILE", help="Cameras and tags of the lab: cameras.toml.")]
 
 
 @dataclass(frozen=True)
@@ -224,7 +228,8 @@ def bridge(
     what: Annotated[
         str,
         Argument(
-            metavar="SYSTEM", help="vicon, optitrack, qualisys, that of a plug-in, or ros2; with --help it says more."
+            metavar="SYSTEM",
+            help="vicon, optitrack, qualisys, cameras, that of a plug-in, or ros2; with --help it says more.",
         ),
     ],
 ) -> int:
@@ -244,3 +249,27 @@ def bridge(
     if what == "ros2":
         return int(import_module("bridges.ros2.bridge").main(words))
     return int(import_module("bridges.motion_capture.publisher").main([what, *words]))
+
+
+@cameras_app.command(epilog=example("cameras calibrate cameras.toml", "cameras calibrate cameras.toml --lens"))
+def calibrate(
+    file: Cameras,
+    *,
+    lens: Annotated[bool, Option("--lens", help="Measure also the lenses that are known.")] = False,
+    limit: Annotated[float, Option(min=1.0, help="Time for the lenses, and for the places [s].")] = 300.0,
+) -> None:
+    """Measure the lenses and the places of cameras, and write them into their file."""
+    from importlib import import_module
+
+    import_module(CAMERAS).calibration().calibrate_file(file, again=lens, limit_s=limit)
+
+
+@cameras_app.command(name="print", epilog=example("cameras print cameras.toml tags.html"))
+def print_sheets(
+    file: Cameras, page: Annotated[Path, Argument(metavar="HTML", help="Page.")] = Path("tags.html")
+) -> None:
+    """Write a page with the tags of a file and the board, to print in true size."""
+    from importlib import import_module
+
+    import_module(CAMERAS).calibration().print_sheets(file, page)
+    print(page)

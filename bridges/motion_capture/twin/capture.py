@@ -247,6 +247,7 @@ class StreamTwin(CaptureTwin):
             return
         connection.setblocking(False)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BACKLOG)
         self.clients[connection] = self._greeted()
         self._flush(connection, self.clients[connection])
 
@@ -324,7 +325,7 @@ class TruthSubscription:
 class CaptureTwinLaunch(NetworkLaunch, frozen=True, kw_only=True, rename="kebab"):
     """A simulated motion capture system that sees simulated robots."""
 
-    system: Annotated[str, Meta(title="SYSTEM", description="vicon, optitrack or qualisys")]
+    system: Annotated[str, Meta(title="SYSTEM", description="vicon, optitrack, qualisys or cameras")]
     robots: Annotated[list[str], Meta(title="ROBOT[=BODY]", description="robots, and their names in the system")]
     listen: Annotated[str, Meta(title="HOST:PORT")] = "127.0.0.1:0"
     rate: Annotated[float, Meta(ge=1, le=1000, title="HZ", description="frames per second")] = 100.0
@@ -337,6 +338,7 @@ class CaptureTwinLaunch(NetworkLaunch, frozen=True, kw_only=True, rename="kebab"
     unit: Annotated[Literal["m"], Meta(title="UNIT", description="m")] = "m"
     version: Annotated[str | None, Meta(title="MAJOR.MINOR", description="version of NatNet, of optitrack")] = None
     multicast: Annotated[bool, Meta(description="frames go to a group on this machine, of optitrack")] = False
+    file: Annotated[str | None, Meta(title="FILE", description="cameras and tags, of cameras")] = None
 
     def twin(self, faults: Faults) -> CaptureTwin:
         """The twin; raises OSError where it cannot listen, ValueError for a system without twin."""
@@ -344,7 +346,9 @@ class CaptureTwinLaunch(NetworkLaunch, frozen=True, kw_only=True, rename="kebab"
         if not path:
             raise ValueError(f"{self.system} has no protocol twin")
         host, port = parse_address(self.listen)
-        special: dict[str, Any] = {"up": self.up, "multicast": self.multicast or None, "version": self.version}
+        special: dict[str, Any] = {
+            "up": self.up, "multicast": self.multicast or None, "version": self.version, "file": self.file
+        }  # fmt: skip
         made: CaptureTwin = pkgutil.resolve_name(path)(
             [robot.partition("=")[2] or robot for robot in self.robots],
             rate_hz=self.rate, sigma=self.sigma, rng=np.random.default_rng(self.seed), faults=faults, host=host,

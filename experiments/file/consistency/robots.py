@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Final
 
-from agents.body.capture_reader import parse_server
 from agents.body.interface import BodyError
 from agents.body.kinds import KINDS, Kind
 from agents.errors import did_you_mean
@@ -66,16 +65,17 @@ def positioning_faults(experiment: Experiment) -> Iterator[Fault]:
         return
     table = () if isinstance(experiment.positioning, str) else ("source",)
     readers = {name: registry.load(registry.POSITIONING, name) for name in registry.names(registry.POSITIONING)}
-    twins = [f"{name}{TWIN}" for name, reader in readers.items() if reader.TWIN]
-    known = ", ".join([*(f"{name}://HOST" for name in readers), *twins])
-    _, scheme, host = capture.source.partition("://")
-    reader = readers.get(capture.system)
-    if reader is None or (capture.source not in twins and not scheme):
+    places = {name: "://FILE" if reader.FILE else "://HOST" for name, reader in readers.items()}
+    twins = {f"{name}{TWIN}": "://FILE" if reader.FILE else "" for name, reader in readers.items() if reader.TWIN}
+    sources = {**places, **twins}
+    known = ", ".join(f"{name}{place}" for name, place in sources.items())
+    addressed = "://" in capture.source
+    if capture.scheme not in sources or addressed != bool(sources[capture.scheme]):
         hint = f"known: {known}; another source publishes the key `position` itself, without `positioning`"
         yield Fault(("positioning", *table), f"no {capture.source!r} among the sources of positions", hint)
-    elif scheme:
+    elif addressed:
         try:
-            parse_server(host, reader.PORT)
+            readers[capture.system].parse(capture.address)
         except ValueError as error:
             yield Fault(("positioning", *table), str(error), f"such as {capture.system}://192.168.10.1")
     measured = [name for name, robot in experiment.robots.items() if robot.position == "external"]

@@ -178,17 +178,20 @@ class CaseProcesses:
         realm = ["--realm", experiment.network.realm]
         capture = experiment.capture
         assert capture is not None
-        host = capture.source.partition("://")[2]
+        host = capture.address
+        if registry.load(registry.POSITIONING, capture.system).FILE:  # it lies beside the experiment
+            host = str(context.source.parent / host)
         bodies = [f"{name}={capture.names.get(name, name)}" for name in measured]
         coordinates = capture.options()
         if capture.simulated:
             asked = (plan.disturbance(name).position_sigma or 0.0 for name in measured)
             sigma = max(LEAST_SIGMA, *asked)
             noise = ["--sigma", str(sigma), "--seed", str(experiment.seed)]
-            arguments = [capture.system, *bodies, "--listen", "127.0.0.1:0", *noise, *coordinates, *realm]
-            twin = context.start(capture.source, "bridges.motion_capture.twin.capture", *arguments)
+            file = ["--file", host] if host else []
+            arguments = [capture.system, *bodies, "--listen", "127.0.0.1:0", *noise, *coordinates, *file, *realm]
+            twin = context.start(capture.scheme, "bridges.motion_capture.twin.capture", *arguments)
             self._standins.append(twin.name)
-            host = twin.await_lines(rf"^{capture.system} (ready on) (\S+)$", 1, context.ended)["ready on"]
+            host = twin.await_lines(rf"^{capture.system} (ready on) (.+)$", 1, context.ended)["ready on"]
         maps = [part for body in bodies for part in ("--map", body)]
         late = f"--latency-s={capture.latency_s}"
         words = [capture.system, host, *maps, *coordinates, late, *realm]

@@ -1,0 +1,369 @@
+"""Cameras with AprilTags, by rendered images: accuracy, cameras that were moved, tags that are there twice, faults."""
+
+import re
+import threading
+from contextlib import contextmanager
+from math import atan2, cos, hypot, inf, sin
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+
+from agents.body.capture_reader import CaptureFrame
+from agents.clock import uptime
+from agents.ticks import Ticks
+from bridges.motion_capture.cameras import file
+from bridges.motion_capture.cameras.calibrate import BOARD, CalibrationError, LensViews, hang
+from bridges.motion_capture.cameras.reader import CamerasReader
+from bridges.motion_capture.cameras.tracker import Tracker
+from bridges.motion_capture.cameras.vision import FLAT, CameraModel, TagDetector, in_space, on_floor, square
+from bridges.motion_capture.publisher import PoseFilter
+from bridges.motion_capture.twin.cameras import CameraImages, CamerasTwin, ImageClient, Sheet, jpeg
+from bridges.motion_capture.twin.capture import upright
+from tests.bridges.motion_capture.cameras_lab import CORNERS, FLOOR, Room, hung, moved, text
+from tests.bridges.motion_capture.test_systems import ALL, BEGIN, FAULTS, LASTS, fault
+from tests.waiting import PATIENCE_S, until
+from twins.device import Faults, serve_until_next
+
+WHEELS = {f"KH0{k}": (k, 0.10, 0.06, True) for k in (1, 2, 3)}
+DRONES = {f"CF0{k}": (k + 3, 0.08, 0.03, False) for k in (1, 2, 3)}
+TILT = 0.08  # standard deviation of a drone's tilt [rad]
+
+
+def lab(bodies=None, **settings):
+    return file.parse(text({**WHEELS, **DRONES} if bodies is None else bodies, **settings))
+
+
+def through_jpeg(image):
+    return cv2.imdecode(np.frombuffer(jpeg(image), np.uint8), cv2.IMREAD_GRAYSCALE)
+
+
+def poses_at(k, names, rng):
+    """True poses in image `k`: robots on circles; drones tilt."""
+    poses = {}
+    for row, name in enumerate(names):
+        angle = 0.03 * k + 1.05 * row
+        radius = 0.9 if row % 2 else 0.5
+        height = 0.0 if name in WHEELS else 0.5 + 0.05 * row
+        tilt = (0.0, 0.0) if name in WHEELS else rng.normal(0.0, TILT, 2)
+        turn = cv2.Rodrigues(np.array([*tilt, 0.0]))[0] @ upright(angle)
+        poses[name] = (radius * cos(angle), radius * sin(angle), height), turn
+    return poses
+
+
+def flown(seen, images=14, cameras="ABCD"):
+    """Distances [mm] and yaw errors [°] of all poses by name, of cameras that expose together."""
+    room, rng = Room(seen), np.random.default_rng(2)
+    tracker, found = Tracker(seen, print), {name: [] for name in seen.bodies}
+    for k in range(images):
+        true = poses_at(k, seen.bodies, rng)
+        frames = [tracker.see(camera, 0.1 * k, through_jpeg(room.image(camera, true))) for camera in cameras]
+        if k == 0:  # of the first camera alone: nothing is known of others
+            continue
+        assert frames[-1][0] == pytest.approx(0.1 * k)
+        for name, pose in frames[-1][1].items():
+            if pose is not None:
+                position, turn = true[name]
+                away = 1e3 * float(np.linalg.norm(np.subtract(pose.position, position)))
+                sine = turn[0, 0] * pose.rotation[3] - turn[1, 0] * pose.rotation[0]
+                found[name].append((away, abs(np.degrees(np.arcsin(sine)))))
+    return found
+
+
+def test_four_cameras_measure_six_robots():
+    found = flown(lab())
+    for names, share in ((WHEELS, 1.0), (DRONES, 0.4)):
+        each = np.array([one for name in names for one in found[name]])
+        assert len(each) >= share * 3 * 13, "drones near a corner are seen by one camera"
+        millimetres, degrees = np.percentile(each, 95, axis=0)
+        assert millimetres <= 3.0
+        assert degrees <= 2.0
+
+
+def test_one_camera_measures_wheels_alone():
+    found = flown(lab(cameras="A"), cameras="A")
+    assert [one for name in DRONES for one in found[name]] == []
+    each = [away for name in WHEELS for away, _ in found[name]]
+    assert len(each) > 15
+    assert np.percentile(each, 95) <= 5.0
+
+
+def test_cameras_that_expose_apart_agree():
+    """Two cameras 33 ms apart, 0.5 m/s: corners are taken at one time, or 17 mm would lie between them."""
+    seen = lab({"CF01": (4, 0.10, 0.0, False)}, cameras="AC")
+    room, tracker, errors = Room(seen), Tracker(seen, print), []
+
+    def true(t):
+        return {"CF01": ((0.5 * t - 0.3, 0.0, 0.5), upright(0.0))}
+
+    for k in range(16):
+        for camera, late in (("A", 0.0), ("C", 0.033)):
+            t = 0.066 * k + late
+            frame = tracker.see(camera, t, room.image(camera, true(t)))
+            if frame is not None and (pose := frame[1]["CF01"]) is not None:
+                errors.append(np.linalg.norm(np.subtract(pose.position, true(frame[0])["CF01"][0])))
+    assert len(errors) > 7
+    assert max(errors) < 0.003
+
+
+@pytest.mark.parametrize("by", [(0.02, 0.0, 0.0), (0.0, 0.0, -0.05)])
+def test_a_camera_that_was_moved_is_unused(by):
+    seen = lab(cameras="ACB")
+    there = msgspec.structs.replace(seen, measured={**seen.measured, "C": moved(seen.measured["C"], by)})
+    room, said, rng = Room(there), [], np.random.default_rng(1)
+    tracker = Tracker(seen, said.append)
+    true = poses_at(0, seen.bodies, rng)
+    for k in range(3):
+        for camera in "ACB":
+            frame = tracker.see(camera, 0.1 * k, room.image(camera, true))
+    assert any(line.startswith("camera C was moved: floor tags are") for line in said)
+    for name in WHEELS:
+        assert np.linalg.norm(np.subtract(frame[1][name].position, true[name][0])) < 0.005
+
+
+def test_a_camera_without_floor_tags_is_unused():
+    seen, said = lab(cameras="A"), []
+    room, tracker = Room(seen, floor={}), Tracker(seen, said.append)
+    true = poses_at(0, seen.bodies, np.random.default_rng(1))
+    assert set(tracker.see("A", 0.0, room.image("A", true))[1].values()) == {None}
+    assert said == ["camera A sees no floor tag: unused, as it may have been moved"]
+
+
+def test_a_tag_that_is_there_twice_is_dropped():
+    bodies = {"KH01": (1, 0.10, 0.06, True), "KH02": (2, 0.10, 0.06, True)}
+    seen = lab(bodies, cameras="AC")
+    room, tracker = Room(seen), Tracker(seen, print)
+    room.bodies = {**room.bodies, "copy": room.bodies["KH01"]}
+    true = {"KH01": ((0.3, 0.0, 0.0), upright(0.0)), "KH02": ((-0.3, 0.0, 0.0), upright(0.0))}
+    for k in range(2):
+        for camera in "AC":
+            image = room.image(camera, {**true, "copy": ((0.0, 0.4, 0.0), upright(0.0))})
+            frame = tracker.see(camera, 0.1 * k, image)
+    assert frame[1]["KH01"] is None
+    assert frame[1]["KH02"] is not None
+
+
+def test_images_of_another_size_are_unused():
+    seen, said = lab(cameras="A"), []
+    tracker = Tracker(seen, said.append)
+    assert tracker.see("A", 0.0, np.zeros((480, 640), np.uint8)) is None
+    assert said == ["camera A gives images of 640 x 480, and was calibrated with 1280 x 720: unused"]
+
+
+def test_views_that_disagree_are_no_pose():
+    one, other = (CameraModel(hung(CORNERS[name])) for name in "AC")
+    corners = 0.1 * FLAT + np.array([0.1, 0.2, 0.5])
+    views = [(camera, camera.project(corners)) for camera in (one, other)]
+    centre, rotation = in_space(views, 0.1)
+    assert centre == pytest.approx((0.1, 0.2, 0.5), abs=1e-6)
+    assert rotation == pytest.approx(np.eye(3), abs=1e-5)
+    assert in_space([(one, views[0][1] + 12.0), views[1]], 0.1) is None
+    assert in_space(views[:1], 0.1) is None, "a camera does not know how far a tag is"
+    assert in_space([views[0], views[0]], 0.1) is None, "nor do two at one place"
+    assert on_floor(views, 0.1, 0.5)[0] == pytest.approx((0.1, 0.2, 0.5), abs=1e-6)
+    assert on_floor(views, 0.1, 0.2) is None, "it stands on something"
+
+
+def test_a_camera_straight_above_measures():
+    """Corners are a perfect square there, at which OpenCV's own solution for squares fails."""
+    above = CameraModel(hung((0.0, 0.0, 2.5), at=(0.0, 1e-6, 0.0)))
+    for yaw in np.arange(-3.0, 3.0, 0.5):
+        corners = square(0.1, 0.2, -0.1, yaw) + np.array([0.0, 0.0, 0.1])
+        centre, rotation = on_floor([(above, above.project(corners))], 0.1, 0.1)
+        assert centre == pytest.approx((0.2, -0.1, 0.1), abs=1e-6)
+        assert np.arctan2(rotation[1, 0], rotation[0, 0]) == pytest.approx(yaw, abs=1e-6)
+
+
+@pytest.mark.parametrize("half_turn", [False, True])
+def test_places_come_from_the_floor(half_turn):
+    """Also with the tags of the AprilTag project, which lie the other way round in OpenCV's eyes."""
+    seen = lab()
+    room, detector = Room(seen, floor={n: (x, y, np.pi * half_turn) for n, (x, y) in FLOOR.items()}), TagDetector(FLOOR)
+    for name, true in seen.measured.items():
+        corners = detector.whole(through_jpeg(room.image(name, {})))[0]
+        bare = msgspec.structs.replace(true, place=(0.0, 0.0, 0.0), turn=(0.0, 0.0, 0.0))
+        placed, error = hang(name, corners, seen.floor, bare)
+        assert placed.half_turn == half_turn
+        assert error < 1.0
+        assert np.linalg.norm(np.subtract(placed.place, true.place)) < 0.01
+
+
+def test_a_floor_tag_elsewhere_is_named():
+    seen = lab(cameras="A")
+    wrong = msgspec.structs.replace(seen.floor, tags={**seen.floor.tags, 22: (1.1, 1.2, 0.0)})
+    corners = TagDetector(FLOOR).whole(Room(seen).image("A", {}))[0]
+    with pytest.raises(CalibrationError, match="floor tag 22 lies elsewhere than"):
+        hang("A", corners, wrong, seen.measured["A"])
+    with pytest.raises(CalibrationError, match="sees of the floor tags 21, 22; it needs 3"):
+        hang("A", {n: corners[n] for n in (21, 22)}, seen.floor, seen.measured["A"])
+
+
+def test_the_lens_comes_from_a_board():
+    true = hung((0.0, 0.0, 0.0), at=(1.0, 0.0, 0.0))
+    images = CameraImages(CameraModel(true), [], np.random.default_rng(1))
+    picture, views, rng = BOARD.generateImage((800, 600)), LensViews(), np.random.default_rng(3)
+    outline = np.array([[-4.0, 3.0, 0.0], [4.0, 3.0, 0.0], [4.0, -3.0, 0.0], [-4.0, -3.0, 0.0]]) * 0.045
+    facing = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # from the board to the room
+    assert not views.add(images.image([]))
+    for k in range(120):
+        across, up = ((k % 3) - 1, (k // 3 % 3) - 1)
+        far = 0.55 + 0.25 * rng.random()
+        turn = facing @ cv2.Rodrigues(rng.uniform(-0.5, 0.5, 3))[0]
+        centre = np.array([far, -0.52 * far * across, 0.27 * far * up])
+        views.add(images.image([Sheet(picture, centre + outline @ turn.T)]))
+        if views.enough:
+            break
+    assert views.enough, (views.count, views.unseen)
+    matrix, lens, error = views.lens()
+    assert error < 0.5
+    assert [matrix[0, 0], matrix[1, 1]] == pytest.approx([720.0, 720.0], rel=0.01)
+    assert [matrix[0, 2], matrix[1, 2]] == pytest.approx([640.0, 360.0], abs=6.0)
+    assert lens[0] == pytest.approx(-0.08, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ("[bodies", "cameras.toml: Expected .* at the end of"),
+        ("rate_hz = -1", r"rate_hz"),
+        ("[bodies.X]\ntag = 20\nsize = 0.1\nheight = 0", "tag 20 stands twice"),
+        ("[bodies.X]\ntag = 587\nsize = 0.1\nheight = 0", r"586.*bodies"),
+        (file.with_measured("", {"Z": hung((0.0, 0.0, 1.0), at=(1.0, 0.0, 0.0))}), "measured.Z. is of no camera"),
+    ],
+)
+def test_wrong_files_are_refused(wrong, words):
+    content = text(WHEELS)
+    content = wrong + "\n" + content.partition("\n")[2] if wrong.startswith("rate") else content + wrong
+    with pytest.raises(file.CamerasFileError, match=words):
+        file.parse(content)
+
+
+def test_bodies_of_a_file_are_those_of_robots():
+    content = text({**WHEELS, **DRONES})
+    CamerasReader.check(content, "cameras.toml", {"KH01": False, "CF01": True})
+    with pytest.raises(ValueError, match=r"no \[bodies.CF09\]; there are: KH01"):
+        CamerasReader.check(content, "cameras.toml", {"CF09": True})
+    with pytest.raises(ValueError, match=r"\[bodies.KH01\] is on_floor, but flies"):
+        CamerasReader.check(content, "cameras.toml", {"KH01": True})
+    with pytest.raises(ValueError, match="no camera is calibrated"):
+        CamerasReader.check(content.partition(file.MARK)[0], "cameras.toml", {})
+
+
+def test_calibration_replaces_what_was_measured():
+    content = text(WHEELS)
+    again = file.with_measured(content, {"A": hung(CORNERS["A"])})
+    assert again.count(file.MARK) == 1
+    read = file.parse(again)
+    assert list(read.measured) == ["A"]
+    assert read.bodies == file.parse(content).bodies
+
+
+class Line:
+    """A twin of two cameras, the tracker and the bridge's filter, without sockets, by the clock of the twin."""
+
+    RATE_HZ = 10.0
+
+    def __init__(self, folder, **faults):
+        lines = text({"cf_1": (4, 0.2, 0.03, False), "kh": (1, 0.2, 0.06, True)}, "ACB", 10.0, **SMALL)
+        (folder / "cameras.toml").write_text(lines)
+        seen = file.parse(lines)
+        self.twin = CamerasTwin(["cf_1", "kh"], file=str(folder / "cameras.toml"), faults=Faults(**faults))
+        self.twin._flush = lambda *_: None
+        self.twin.clients = {name: ImageClient(streams=True, camera=name) for name in seen.cameras}
+        self.said, self.published = [], []
+        self.tracker = Tracker(seen, self.said.append)
+        self.filter = PoseFilter({"CF01": "cf_1", "KH01": "kh"}, self.said.append)
+        self.last, self.number = {}, 0
+
+    def run(self, until):
+        for k in range(1, round(until * self.RATE_HZ) + 1):
+            t = k / self.RATE_HZ
+            self.twin.place(0, np.array([0.3 * cos(t), 0.3 * sin(t), 0.5]), upright(t))
+            self.twin.place(1, np.array([-0.4, 0.1 * t, 0.0]), upright(0.0))
+            self.twin.advance(t)
+            for name, client in self.twin.clients.items():
+                self._take(name, client, t)
+
+    def _take(self, name, client, t):
+        head, _, rest = bytes(client.unsent).partition(b"\r\n\r\n")
+        client.unsent.clear()
+        length = re.search(rb"Content-Length: (\d+)", head)
+        if length is None or rest[: int(length[1])] == self.last.get(name):
+            return
+        self.last[name] = rest[: int(length[1])]
+        image = cv2.imdecode(np.frombuffer(self.last[name], np.uint8), cv2.IMREAD_GRAYSCALE)
+        if image is None or (found := self.tracker.see(name, t, image)) is None:
+            return
+        self.number += 1
+        frame = CaptureFrame(self.number, found[1], 0.0, "z")
+        for robot, stamp, position, yaw in self.filter.filter_poses(frame, found[0]):
+            self.published.append((robot, stamp, position, yaw))
+            assert hypot(*position[:2]) < 1.0
+
+    def count(self, robot, begin, end=inf):
+        return sum(name == robot and begin <= stamp < end for name, stamp, *_ in self.published)
+
+
+SMALL = {"size": (800, 600), "focal": 560.0}
+
+
+@pytest.mark.parametrize("name", [*FAULTS, "damaged"])
+def test_each_fault_of_cameras(tmp_path, name):
+    faults, hidden, _ = FAULTS.get(name, (fault(name), ALL, ""))
+    line = Line(tmp_path, **faults)
+    end = BEGIN + faults.get("capture_for_s", LASTS)
+    line.run(end + 1.2)
+    line.twin.clients.clear()
+    line.twin.close()
+    for robot in ALL:
+        assert line.count(robot, 0.05, BEGIN - 0.01) >= 3 or name == "lost frames"
+        assert line.count(robot, end + 0.6) >= 3, line.said
+        during = line.count(robot, BEGIN + 0.1, BEGIN + 0.45)
+        assert during == 0 if robot in hidden else during >= 1, (robot, line.said)
+
+
+def test_images_come_over_http(tmp_path):
+    """A server of the twin, and the reader with its threads; a camera that ends is connected again."""
+    (tmp_path / "cameras.toml").write_text(text({"KH01": (1, 0.16, 0.06, True)}, "AC", 20.0, **SMALL))
+
+    @contextmanager
+    def running(port=0):
+        twin, over = CamerasTwin(["KH01"], file=str(tmp_path / "cameras.toml"), port=port), threading.Event()
+        twin.place(0, np.array([0.2, -0.1, 0.0]), upright(0.5))
+
+        def serve():
+            ticks = Ticks(20.0, clock=uptime)
+            while not over.is_set():
+                twin.advance(serve_until_next(twin, ticks))
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        try:
+            yield twin.address
+        finally:
+            over.set()
+            thread.join()
+            twin.close()
+
+    def seen():
+        frame = reader.newest(0.2)
+        frames.extend([frame] if frame and frame.poses["KH01"] else [])
+        return len(frames) > count
+
+    frames, count = [], 0
+
+    with pytest.raises(OSError, match=r"A: .*refused, C: .*refused"):
+        CamerasReader(f"{tmp_path}/cameras.toml@127.0.0.1:9", 0, 0.5)
+    with running() as address:
+        reader = CamerasReader(address, 0, PATIENCE_S)
+        until(seen)
+        frame = frames[0]
+        x, y, z = frame.poses["KH01"].position
+        assert (x, y, z) == pytest.approx((0.2, -0.1, 0.0), abs=0.005)
+        assert atan2(frame.poses["KH01"].rotation[3], frame.poses["KH01"].rotation[0]) == pytest.approx(0.5, abs=0.05)
+        assert frame.latency_s > 0.0
+    with running(int(address.rpartition(":")[2])):
+        count = len(frames) + 3
+        until(seen)
+        reader.close()
