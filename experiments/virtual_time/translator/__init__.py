@@ -1,4 +1,4 @@
-"""From functions in Python to text in C: types and values, expressions, statements.
+"""From functions in Python to text in C: types and values, expressions, calls, statements.
 
 May import: agents.decision.stepping, agents.plugins.law, agents.vectors, experiments.virtual_time.records,
 experiments.virtual_time.laws.

@@ -22,7 +22,8 @@ from types import FunctionType
 from typing import Any, Final, NamedTuple
 
 from experiments.virtual_time.records import Items, RecordLayout
-from experiments.virtual_time.translator.expressions import NEW_SUMS, Expressions, calls
+from experiments.virtual_time.translator.calls import NEW_SUMS, Calls
+from experiments.virtual_time.translator.expressions import calls
 from experiments.virtual_time.translator.kinds import (
     BOOLEAN,
     DOUBLE,
@@ -161,7 +162,7 @@ class Program:
         return "\n".join([ARITHMETIC.read_text(encoding="utf-8"), *self._texts, walk.text("stretch"), fly])
 
 
-class Walk(Expressions):
+class Walk(Calls):
     """Statements of a function in C."""
 
     def result_for(self, types: Sequence[Any]) -> Any:

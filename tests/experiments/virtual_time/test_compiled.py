@@ -31,7 +31,7 @@ from experiments.definition.experiment import (
     WorldTable,
 )
 from experiments.virtual_time import machine, stretch
-from experiments.virtual_time.translator.expressions import NEW_SUMS
+from experiments.virtual_time.translator.calls import NEW_SUMS
 from tests.agents.plugins.test_every_plugin import made as plugin
 from tests.experiments.virtual_time.evaluators import alike, evaluated, same
 from tests.small import changed

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from experiments.virtual_time import machine
 from experiments.virtual_time.records import Image, Layouts
 from experiments.virtual_time.translator import translation
-from experiments.virtual_time.translator.expressions import NEW_SUMS
+from experiments.virtual_time.translator.calls import NEW_SUMS
 from experiments.virtual_time.translator.kinds import LARGEST, WHOLE, OutsideError
 from experiments.virtual_time.translator.translation import Program
 from tests.cases import examples
