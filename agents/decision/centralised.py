@@ -145,7 +145,7 @@ class Centre:
                 stepping.speech.record()
                 robot.words = dict(stepping.speech.words)
                 for computer, link in robot.receivers:
-                    computer.neighbours.all[link].said = robot.words
+                    computer.neighbours.hear(link, robot.words)
 
     def _step(self, row: int, t: float, position: Vector, start: float) -> None:
         """Prepare the step of a law that remembers; one that says something steps here, as on a robot."""

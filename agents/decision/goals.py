@@ -35,7 +35,8 @@ class GoalComputer:
         self.stepping = None if isinstance(assignment.law, Gradient) else Stepping(assignment)
         self.law = cast(Gradient, assignment.law)
         self._anchors, self.predictor, self._changes = assignment.anchors, assignment.predictor, assignment.changes
-        self.neighbours = Neighbours(links, assignment.limits.neighbour_timeout_s)
+        says = None if self.stepping is None else self.stepping.says
+        self.neighbours = Neighbours(links, assignment.limits.neighbour_timeout_s, says)
         self.clamp = assignment.clamp  # largest step of a goal per axis and decision [m]
         self.tracking_gain = assignment.tracking_gain  # k of (7) [1/(m² decision)]
         self._flies, self.ground = assignment.kind.flies, assignment.ground  # height that it holds [m]
@@ -181,7 +182,7 @@ class GoalComputer:
         self.error, self.energy = total, energy
 
     def step(self, t: float, position: Vector, velocity: Vector, yaw: float, start: float) -> None:
-        """Let a law that is no gradient step; for the arguments see `decide`. Not quiet."""
+        """Let a law that is no gradient step; for the arguments see `decide`. Quiet, if the law is."""
         if self.changes_shape:
             self.reshape(t - start, position, t)
         if self.stepping is not None:
@@ -191,15 +192,14 @@ class GoalComputer:
         """Whether the law, asked at `t` [s] for a robot that stands at `position` [m], wants what is finite."""
         if self.stepping is None:
             return is_finite(self.law_offset(t, position))
-        return is_sound(self.stepping.rehearse(self.view(t, position, ZERO, 0.0, t)))
+        control = self.stepping.rehearse(self.view(t, position, ZERO, 0.0, t))
+        return is_sound(control.velocity) and is_sound(control.goal)
 
     def unknown_reads(self, t: float, position: Vector) -> str:
         """Words on what the law reads although it is unknown; empty without. In flight, too: it changes nothing."""
         stepping, law = self.stepping, self.law
         if stepping is not None:
-            view = self._sight(t, position, ZERO, 0.0)
-            if self.itinerary is not None:
-                view.target = position
+            view = self._sight(t, position, ZERO, 0.0, UNKNOWN if self.itinerary is None else position, ZERO)
             return unknown_reads(law, lambda watched: stepping.rehearse(watched(view)))
         senders = [each for each in self.neighbours.all if each.active]
         return unknown_reads(
@@ -208,29 +208,31 @@ class GoalComputer:
         )
 
     def view(self, t: float, position: Vector, velocity: Vector, yaw: float, start: float) -> View:
-        """View of a law that is no gradient; for the arguments see `decide`."""
-        view = self._sight(t, position, velocity, yaw)
+        """View of a law that is no gradient; for the arguments see `decide`. Quiet."""
+        target, speed = UNKNOWN, ZERO
+        stepping = self.stepping
+        assert stepping is not None
         if self.itinerary is not None:
             x, y, z, _ = self.itinerary.target(t - start, (position[0], position[1], self.ground), yaw)
-            view.target = x, y, z
-            view.target_velocity = cast(Stepping, self.stepping).speed_of(view.target, view.step_s)
-        return view
+            target = x, y, z
+            speed = stepping.speed_of(target, stepping.length())
+        return self._sight(t, position, velocity, yaw, target, speed)
 
-    def _sight(self, t: float, position: Vector, velocity: Vector, yaw: float) -> View:
-        """View without the target of the plan."""
-        stepping, predictor = cast(Stepping, self.stepping), self.predictor
-        view = stepping.view()
-        view.position, view.velocity, view.yaw = position, velocity, yaw
-        view.leads = not self.follows
-        view.neighbours = [
+    def _sight(  # noqa: PLR0917 - quiet
+        self, t: float, position: Vector, velocity: Vector, yaw: float, target: Vector, speed: Vector
+    ) -> View:
+        """View with this target of the plan [m], and its speed [m/s]."""
+        stepping, predictor = self.stepping, self.predictor
+        assert stepping is not None
+        neighbours = [
             NeighbourView(
                 sender.sender, sender.name, sender.place(predictor, t), sender.velocity, sender.yaw, t - sender.stamp,
-                stepping.said_by(sender.said), sender.link,
+                dict(sender.said), sender.link,
             )
             for sender in self.neighbours.all
             if sender.active
         ]  # fmt: skip
-        return view
+        return stepping.view(neighbours, position, velocity, yaw, target, speed, not self.follows)
 
     def _decide_by_steps(  # noqa: PLR0917 - quiet: compilers take no arguments by name alone
         self, stepping: Stepping, t: float, position: Vector, velocity: Vector, yaw: float, start: float

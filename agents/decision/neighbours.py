@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from math import inf, isfinite, nan
-from typing import Final
+from typing import ClassVar, Final
 
 import msgspec
 
@@ -40,7 +40,9 @@ class Incoming(msgspec.Struct, frozen=True):
 class Neighbour:
     """Sender of one link: its target, its last pose, and its liveliness."""
 
-    def __init__(self, incoming: Incoming) -> None:
+    NAMED: ClassVar = ("said",)
+
+    def __init__(self, incoming: Incoming, unsaid: Mapping[str, tuple[float, ...]] = NO_WORDS) -> None:
         self.sender, self.name = incoming.sender, incoming.name
         self.radius, self.height, self.lag = incoming.kind.radius, incoming.kind.height, incoming.kind.lag
         self.in_law, self.awaited, self.targets = incoming.in_law, incoming.awaited, incoming.targets
@@ -51,7 +53,7 @@ class Neighbour:
         self.position = UNKNOWN  # last received [m], NaN before; of a former process until its successor has sent one
         self.velocity = ZERO  # [m/s]
         self.yaw = nan  # [rad], NaN where unknown
-        self.said = NO_WORDS  # variables beside its last pose, by name
+        self.said = unsaid  # variables beside its last pose, by name; NaN where unknown
         self.stamp = -inf  # time of measurement, limited to plausible values [s]; −inf before the first pose
         self.arrival = -inf  # time of reception [s]
         self.lost_since = -inf  # its loss [s]; inf: alive; −inf: token never seen, a pose is no sign of life
@@ -83,9 +85,14 @@ class Neighbour:
 class Neighbours:
     """All senders of one robot."""
 
-    def __init__(self, incoming: Sequence[Incoming], silence_s: float) -> None:
-        """Start without poses; lost senders leave the law after `silence_s` [s]."""
-        self.all = [Neighbour(each) for each in incoming]  # same order as the links
+    def __init__(self, incoming: Sequence[Incoming], silence_s: float, says: Mapping[str, int] | None = None) -> None:
+        """Start without poses; lost senders leave the law after `silence_s` [s].
+
+        Args:
+            says: Sizes of the variables beside poses that the law knows.
+        """
+        self._unsaid = {name: (nan,) * size for name, size in (says or {}).items()}
+        self.all = [Neighbour(each, self._unsaid) for each in incoming]  # same order as the links
         self.incomplete = True  # a sender is missing or lost, so that time alone can change the active links
         self.lagging = False  # the clock of a sender lags
         self.refused = False  # all poses of a sender are refused
@@ -104,8 +111,17 @@ class Neighbours:
         if not stamp > sender.stamp:
             return False
         sender.position, sender.velocity, sender.stamp, sender.arrival = position, velocity, stamp, arrival
-        sender.yaw, sender.said = yaw, said
+        sender.yaw = yaw
+        self.hear(link, said)
         return True
+
+    def hear(self, link: int, said: Mapping[str, tuple[float, ...]]) -> None:
+        """Store the variables beside the last pose: NaN for those left out, or of another size than the law's."""
+        unsaid = self._unsaid
+        if unsaid:
+            fit = {name for name, nothing in unsaid.items() if len(said.get(name, ())) == len(nothing)}
+            unsaid = {name: said[name] if name in fit else nothing for name, nothing in unsaid.items()}
+        self.all[link].said = unsaid
 
     def mark_lost(self, link: int, t: float) -> None:
         """Liveliness token of the sender lost at `t` [s]."""
@@ -123,7 +139,7 @@ class Neighbours:
         sender = self.all[link]
         sender.velocity = ZERO
         sender.stamp, sender.arrival = -inf, -inf
-        sender.yaw, sender.said = nan, NO_WORDS
+        sender.yaw, sender.said = nan, self._unsaid
         self.incomplete = True
 
     def mark_clock_lag(self, link: int, lag: float) -> None:

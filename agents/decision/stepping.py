@@ -5,7 +5,7 @@ Memory belongs to the decision, never to the law: a step returns it, and it is k
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from math import dist, inf, isfinite, nan
 from numbers import Real
 from typing import Any, ClassVar, Final
@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Final
 from agents.decision.assignment import Assignment
 from agents.network.validation import ENORMOUS, MAX_NUMBERS
 from agents.plugins.calls import failure, wrong
-from agents.plugins.law import Control, Law, Memory, RobotFacts, Said, Values, View, is_known
+from agents.plugins.law import Control, Law, Memory, NeighbourView, RobotFacts, Said, Values, View, is_known
 from agents.plugins.registry import FAILURES, PluginError
 from agents.vectors import UNKNOWN, ZERO, Vector, is_finite
 
@@ -31,9 +31,12 @@ class Speech:
     not move yet.
     """
 
+    FIXED: ClassVar = ("metres",)
+    NAMED: ClassVar = ("now", "before")
+
     def __init__(self, law: Law, memory: Memory) -> None:
-        self._metres = {name: said.metre for name, said in law.SAYS.items()}
-        self.now: dict[str, Values] = {}
+        self.metres = {name: float(law.SAYS[name].metre) for name in sorted(law.SAYS)}  # see `Said`
+        self.now = {name: (nan,) * len(memory[name]) for name in self.metres}
         self.before = self.now  # variables as said last, unless the present ones are said
         self.current = True  # the present variables are said; at first as they begin
         self.update(memory)
@@ -41,29 +44,33 @@ class Speech:
         self.current = True
 
     def update(self, memory: Memory) -> None:
-        """The variables are these after a step."""
+        """The variables are these after a step. Quiet."""
         if self.current:
             self.before = self.now
         self.stepped, self.current = True, False
-        self.now = {name: tuple(map(rounded, memory[name])) for name in self._metres}
+        self.now = {name: tuple(map(rounded, memory[name])) for name in self.metres}
         self.change = 0.0  # largest deviation of a variable from what was said, in metres; infinite if one is new
-        for name, metre in self._metres.items():
-            self.change = deviation(self.change, self.now[name], self.before.get(name, ()), metre)
+        for name in self.metres:
+            self.change = deviation(self.change, self.now[name], self.before[name], self.metres[name])
 
     @property
     def said(self) -> Memory:
-        """Variables as said last; at first as they begin."""
+        """Variables as said last; at first as they begin. Quiet."""
         return self.now if self.current else self.before
+
+    def says(self, name: str) -> bool:
+        """Whether a variable is said: a number of it may be unknown. Quiet."""
+        return self.spoken and is_known(self.said[name])
 
     @property
     def words(self) -> Words:
         """Variables as said last, those that are known."""
-        return _known(self.said) if self.spoken else ()
+        return tuple((name, values) for name, values in self.said.items() if self.says(name))
 
     @property
     def fresh(self) -> Words:
         """Variables that a transmission says now, those that are known."""
-        return _known(self.now) if self.stepped else ()
+        return tuple((name, values) for name, values in self.now.items() if self.stepped and is_known(values))
 
     def deviation(self, of_pose: float) -> float:
         """Largest deviation of what neighbours know, of pose and variables [m]; infinite if one is new. Quiet."""
@@ -81,7 +88,9 @@ class Speech:
 class Stepping:
     """A law at work for one robot."""
 
-    RARE: ClassVar = ("control", "law", "scan")
+    NAMED: ClassVar = ("memory",)
+    MEASURED: ClassVar = ("measures",)
+    CHECKS: ClassVar = ("checked",)
 
     def __init__(self, assignment: Assignment) -> None:
         """Begin; raises PluginError if `begin` of the law fails or gives what cannot be used."""
@@ -94,18 +103,17 @@ class Stepping:
         )  # fmt: skip
         self.memory = self._begin()
         self.speech = Speech(law, self.memory) if law.SAYS else None  # None: the law says nothing
-        self.control = Control()  # result of the last step: a velocity [m/s], or a goal [m], and a yaw [rad]
+        # result of the last step: a velocity [m/s], or a goal [m], and a yaw [rad]
         self.velocity, self.goal, self.yaw = REST, UNKNOWN, nan
-        self.gives_goal = False
-        self.measures: dict[str, float] = {}  # likewise
-        self.mind: Any = None  # the same in compiled ticks, while there are any
+        self.gives_velocity = self.gives_goal = False
+        self.measures: Mapping[str, float] = {}  # likewise
         self.moves = True  # the robot may move; set by its caller, and likewise
         self.scan: Any = None  # range readings
         self.deviation = nan  # deviation of what the neighbours believe [m]
         self.tick, self.stepped = 0, -1  # number of the tick since the common start
         self._target = UNKNOWN
 
-    def _begin(self) -> dict[str, Values]:
+    def _begin(self) -> Memory:
         law = self.law
         if not (isinstance(law.SAYS, Mapping) and all(isinstance(said, Said) for said in law.SAYS.values())):
             raise PluginError(f"SAYS of the law {type(law).__name__} must name a Said for each variable")
@@ -134,24 +142,18 @@ class Stepping:
     @property
     def says(self) -> dict[str, int]:
         """Sizes of the variables that it says, by name."""
-        return {name: len(self.memory[name]) for name in self.law.SAYS}
+        return {name: len(self.memory[name]) for name in sorted(self.law.SAYS)}
 
-    def said_by(self, words: Mapping[str, Values]) -> dict[str, Values]:
-        """Variables that a neighbour said; NaN for those that it did not say, or that have another size."""
-        found = {}
-        for name in self.law.SAYS:
-            said, size = words.get(name, ()), len(self.memory[name])
-            found[name] = said if len(said) == size else (nan,) * size
-        return found
-
-    def view(self) -> View:
-        """View for the next step, without what is not known here."""
-        view = View(self.facts, {} if self.speech is None else self.speech.said, ())
-        view.time = self.tick * self.tick_s
-        view.moves, view.scan = self.moves, self.scan
-        view.deviation = self.deviation
-        view.step_s = self.length()
-        return view
+    def view(  # noqa: PLR0917 - quiet
+        self, neighbours: Sequence[NeighbourView] = (), position: Vector = UNKNOWN, velocity: Vector = ZERO,
+        yaw: float = 0.0, target: Vector = UNKNOWN, speed: Vector = ZERO, leads: bool = False,
+    ) -> View:  # fmt: skip
+        """View for the next step; for the arguments see `View`. Quiet."""
+        said = {} if self.speech is None else self.speech.said
+        return View(
+            self.facts, said, neighbours, self.tick * self.tick_s, position, velocity, yaw, target, speed, self.scan,
+            self.deviation, leads, self.moves, step_s=self.length(),
+        )  # fmt: skip
 
     def length(self) -> float:
         """Length of the next step [s]; quiet."""
@@ -170,21 +172,27 @@ class Stepping:
         return speed
 
     def step(self, view: View) -> None:
-        """Step, and keep what the law decided."""
-        self.control = control = self.rehearse(view)
-        self.gives_goal = control.goal is not None
-        self.velocity, self.goal = _vector(control.velocity, REST), _vector(control.goal, UNKNOWN)
-        self.yaw = float(control.yaw)
-        self.memory = {name: tuple(map(float, values)) for name, values in control.memory.items()}
-        self.measures = {name: float(value) for name, value in control.measures.items()}
-        self.stepped = self.tick
+        """Step, and keep what the law decided. Quiet, if the law is."""
+        control = self.rehearse(view)
+        self.gives_velocity, self.gives_goal = control.velocity is not None, control.goal is not None
+        self.velocity = REST if control.velocity is None else control.velocity
+        self.goal = UNKNOWN if control.goal is None else control.goal
+        self.yaw, self.memory = control.yaw, control.memory
+        self.measures, self.stepped = control.measures, self.tick
         if self.speech is not None:
             self.speech.update(self.memory)
 
     def rehearse(self, view: View) -> Control:
         """Step of the law, of which nothing is kept. Raises PluginError where a result is not what it must be."""
+        # a law that writes into its memory must not count rehearsals
+        return self.checked(self.law.step(view, dict(self.memory)))
+
+    def checked(self, control: Control) -> Control:
+        """Result of a law, in floats; raises PluginError where it is not what it must be.
+
+        A compiled step is sure of it, by the types of its values.
+        """
         law, memory = self.law, self.memory
-        control = law.step(view, dict(memory))  # one that writes into it must not count rehearsals
         if not isinstance(control, Control):
             raise wrong("law", law, "step", control, "a Control")
         sizes = {name: len(values) for name, values in memory.items()}
@@ -198,12 +206,16 @@ class Stepping:
                 raise wrong("law", law, "step", way, "three numbers as velocity or goal")
         if not (isinstance(control.yaw, Real) and all(isinstance(each, Real) for each in control.measures.values())):
             raise wrong("law", law, "step", control, "a number as yaw and as each of its measures")
-        return control
+        return Control(
+            {name: tuple(map(float, values)) for name, values in control.memory.items()},
+            _vector(control.velocity), _vector(control.goal), float(control.yaw),
+            {name: float(value) for name, value in control.measures.items()},
+        )  # fmt: skip
 
     @property
     def sound(self) -> bool:
         """Whether all that the last step decided for the body is finite, or a height that is left out."""
-        return is_sound(self.control)
+        return is_sound(self.velocity) and (is_sound(self.goal) or not self.gives_goal)
 
 
 def deviation(change: float, now: Values, said: Values, metre: float) -> float:
@@ -215,10 +227,9 @@ def deviation(change: float, now: Values, said: Values, metre: float) -> float:
     return max(change, dist(now, said) / metre)
 
 
-def is_sound(control: Control) -> bool:
-    """Whether a velocity or goal is finite, apart from a height that is left out."""
-    ways = (way for way in (control.velocity, control.goal) if way is not None)
-    return all(isfinite(x) and isfinite(y) and abs(z) != inf for x, y, z in ways)
+def is_sound(way: Vector | None) -> bool:
+    """Whether a velocity or goal is finite, apart from a height that is left out; it may be left out itself."""
+    return way is None or (isfinite(way[0]) and isfinite(way[1]) and abs(way[2]) != inf)
 
 
 def rounded(value: float) -> float:
@@ -226,14 +237,10 @@ def rounded(value: float) -> float:
     return float(f"{value:.{DIGITS}g}") if abs(value) <= ENORMOUS else nan
 
 
-def _known(variables: Memory) -> Words:
-    return tuple((name, values) for name, values in variables.items() if is_known(values))
-
-
-def _vector(values: Iterable[float] | None, other: Vector) -> Vector:
-    """Three numbers as floats, or another vector in place of None."""
+def _vector(values: Iterable[float] | None) -> Vector | None:
+    """Three numbers as floats, if there are any."""
     if values is None:
-        return other
+        return None
     x, y, z = map(float, values)
     return x, y, z
 

@@ -6,16 +6,17 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from math import nan
 from typing import Final
 
 from agents.decision.neighbours import Neighbour
+from agents.decision.stepping import Speech, Stepping
 from agents.network.channel_model import ROUNDING_S
 from agents.plugins.planners import NO_TARGET
 from agents.robot import Robot
 from agents.vectors import Pose, Vector
-from experiments.virtual_time.laws import MEASURES, Mind, Variables, numbers, speak, variables
+from experiments.virtual_time.records import MEASURES, numbers
 from twins.body import Twin
 
 WIDTH: Final = 19  # numbers of a robot in a sample
@@ -41,14 +42,12 @@ class Way:
     wide: int  # numbers of a sample
     # time of arrival [s], number, stamp [s], position [m], velocity [m/s], yaw [rad] and words of each
     samples: array[float]
-    said: Variables  # words beside the last pose that was received
 
-    def __init__(self, neighbour: Neighbour, delay: float, size: int, says: Mapping[str, int]) -> None:
-        """`says`: sizes of the variables beside poses."""
+    def __init__(self, neighbour: Neighbour, delay: float, size: int, words: int) -> None:
+        """`words`: numbers beside a pose."""
         self.neighbour, self.delay, self.size = neighbour, delay, size
         self.first, self.next = 0, 0
-        self.said = variables(says)
-        self.wide = SENT + sum(says.values())
+        self.wide = SENT + words
         self.samples = array("d", (0.0,)) * (self.wide * size)
 
     def put(  # noqa: PLR0917 - quiet
@@ -67,7 +66,7 @@ class Way:
 
     def deliver(self, t: float) -> None:
         """The receiver gets the samples that have arrived by `t` [s]."""
-        samples, said = self.samples, numbers(self.said)
+        samples, said = self.samples, numbers(self.neighbour.said)
         while self.first != self.next and samples[self.first * self.wide] <= t + ROUNDING_S:
             k, sender = self.first * self.wide, self.neighbour
             if samples[k + 2] > sender.stamp:
@@ -83,21 +82,19 @@ class Way:
 class Member:
     """Robot with its twin, and the links on which it sends."""
 
-    __slots__ = ("mind", "robot", "row", "seq", "twin", "ways", "words")
+    __slots__ = ("robot", "row", "seq", "twin", "ways", "words")
 
     row: int
     seq: int  # number of its last transmission
     robot: Robot
     twin: Twin
     ways: list[Way]
-    mind: Mind | None  # law that remembers
     words: array[float]  # words of the last transmission
 
     def __init__(self, row: int, robot: Robot, twin: Twin, words: int) -> None:
         """`words`: numbers beside a pose."""
         self.row, self.robot, self.twin = row, robot, twin
         self.seq, self.ways = 0, []
-        self.mind = None if robot.stepping is None else Mind(robot.stepping)
         self.words = array("d", (nan,)) * words
 
 
@@ -122,7 +119,7 @@ class Planned:
 class Ledger:
     """Notes of a run."""
 
-    __slots__ = ("count", "lean", "memory", "minds", "reason", "rows", "sample", "samples", "sent", "times", "wide")
+    __slots__ = ("count", "laws", "lean", "memory", "reason", "rows", "sample", "samples", "sent", "times", "wide")
 
     lean: bool  # True for samples of true positions alone
     reason: int  # why a stretch ended: `AT_END`, or with the tick half done `AT_PHASES` or `AT_HAZARDS`
@@ -134,7 +131,7 @@ class Ledger:
     times: array[float]  # times of samples [s]
     samples: array[float]  # `WIDTH` numbers for each sample and robot, or `LEAN`
     memory: int  # most numbers of the memory of a law
-    minds: array[float]  # memory, number of its measures, and `MEASURES` of these for each sample and robot
+    laws: array[float]  # memory and measures, see `Measured`, for each sample and robot
 
     def __init__(self, members: Sequence[Member], transmissions: int, samples: int, *, lean: bool) -> None:
         """Ledger of `transmissions` of each member, and `samples`."""
@@ -144,9 +141,9 @@ class Ledger:
         self.reason = AT_END
         self.times = array("d", (0.0,)) * samples
         self.sent = array("d", (0.0,)) * (self.wide * transmissions * rows)
-        sizes = [0 if lean else sum(map(len, each.mind.memory.all().values())) for each in members if each.mind]
-        self.memory = max(sizes, default=0)
-        self.minds = array("d", (0.0,)) * ((self.memory + 1 + MEASURES) * samples * rows * bool(sizes))
+        memories = [each.robot.stepping.memory for each in members if each.robot.stepping is not None]
+        self.memory = 0 if lean else max([sum(map(len, each.values())) for each in memories], default=0)
+        self.laws = array("d", (0.0,)) * ((self.memory + 1 + MEASURES) * samples * rows * bool(memories))
         self.samples = array("d", (0.0,)) * ((LEAN if lean else WIDTH) * samples * rows)
 
     def note_sent(self, member: Member, t: float) -> None:
@@ -165,8 +162,8 @@ class Ledger:
         """Note the state of a robot in the present sample."""
         robot, samples = member.robot, self.samples
         state = robot.now.state
-        if member.mind is not None:
-            self.note_mind(member.mind, self.sample * self.rows + member.row)
+        if robot.goals.stepping is not None:
+            self.note_law(robot.goals.stepping, self.sample * self.rows + member.row)
         if self.lean:
             k = LEAN * (self.sample * self.rows + member.row)
             samples[k], samples[k + 1], samples[k + 2] = state.true_position
@@ -180,17 +177,14 @@ class Ledger:
         samples[k + 14], samples[k + 15], samples[k + 16], samples[k + 17] = robot.setpoint
         samples[k + 18] = robot.error
 
-    def note_mind(self, mind: Mind, row: int) -> None:
-        """Note what a law remembers and measures, as one row of `minds`."""
-        k, minds = (self.memory + 1 + MEASURES) * row, self.minds
-        memory = numbers(mind.memory)
+    def note_law(self, stepping: Stepping, row: int) -> None:
+        """Note what a law remembers and measures, as one row of `laws`."""
+        k, laws = (self.memory + 1 + MEASURES) * row, self.laws
         if not self.lean:
-            for j in range(len(memory)):
-                minds[k + j] = memory[j]
-        k += self.memory
-        minds[k] = float(mind.measured)
-        for j in range(MEASURES):
-            minds[k + 1 + j] = mind.measures[j]
+            for j, value in enumerate(numbers(stepping.memory)):
+                laws[k + j] = value
+        for j, value in enumerate(numbers(stepping.measures)):
+            laws[k + self.memory + j] = value
 
 
 class Crew:
@@ -235,11 +229,21 @@ def transmit(members: list[Member], t: float, ledger: Ledger) -> None:
         if robot.question(t):
             member.seq += 1
             speech = robot.transmitter.speech
-            if member.mind is not None and speech is not None:
-                speak(member.mind, speech, member.words)
+            if speech is not None:
+                speak(speech, member.words)
             ledger.note_sent(member, t)
             for way in member.ways:
                 way.put(member.seq, t, robot.sent_position, robot.sent_velocity, robot.now.state.yaw, member.words)
+
+
+def speak(speech: Speech, words: array[float]) -> None:
+    """Words of a transmission, NaN for a variable that is not said."""
+    k = 0
+    for name in speech.metres:
+        says = speech.says(name)
+        for value in speech.said[name]:
+            words[k] = value if says else nan
+            k += 1
 
 
 def detect(members: list[Member], t: float) -> bool:

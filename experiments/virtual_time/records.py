@@ -1,14 +1,16 @@
 """Objects of a tick as records in memory, for functions that are compiled.
 
 Numbers stand in a record as they are, tuples of numbers in place, other objects and lists as addresses, eight bytes
-each. Which attributes a record has follows from the values that an object has; texts and the like are left out.
+each. Which attributes a record has follows from the values that an object has; texts and the like are left out. A class
+names in `FIXED` attributes that are constants, in `RARE` those that quiet functions do not use, in `NAMED` dictionaries
+of tuples of floats with the same names for ever, in `MEASURED` those of floats by the names of measures.
 """
 
 from __future__ import annotations
 
 import struct
 from array import array
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from itertools import chain
@@ -22,6 +24,7 @@ WORD: Final = 8  # bytes
 FLOAT, INT, BOOL = "float", "int", "bool"
 NUMBERS: Final[dict[type, str]] = {float: FLOAT, int: INT, bool: BOOL}
 LONG: Final = 1000  # length from which a text or a table of a law is none that its step reads
+MEASURES: Final = 12  # most measures of the laws of a run
 LEFT_OUT: Final = {"assignment", "_assignment", "_generator", "_preflight"}  # names of no use to a quiet function
 
 
@@ -29,6 +32,19 @@ class Floats(NamedTuple):
     """Tuple of numbers."""
 
     size: int
+
+
+class Named(NamedTuple):
+    """Dictionary of tuples of numbers, in the order of their names."""
+
+    names: tuple[str, ...]
+    sizes: tuple[int, ...]
+
+
+class Measured(NamedTuple):
+    """Dictionary of measures: a bit for each that is there, as a float, and their values."""
+
+    size: int = 1 + MEASURES
 
 
 @dataclass(frozen=True)
@@ -63,9 +79,14 @@ class RecordLayout:
 
 def width(kind: Any) -> int:
     """Words that a value takes."""
-    if isinstance(kind, Floats):
+    if isinstance(kind, Floats | Measured):
         return kind.size
-    return 2 if isinstance(kind, Items) else 1
+    return sum(kind.sizes) if isinstance(kind, Named) else 2 if isinstance(kind, Items) else 1
+
+
+def numbers(of: Any) -> list[float]:
+    """All numbers of a dictionary that is `Named` or `Measured`, where they stand; in compiled functions alone."""
+    raise TypeError(type(of).__name__)
 
 
 @cache
@@ -146,20 +167,24 @@ class Layouts:
         owner: type = type(thing)
         fields, fixed = dict[str, Any](), dict[str, Any]()
         names, rare = getattr(owner, "FIXED", ()), LEFT_OUT | set(getattr(owner, "RARE", ()))
+        named, measured = getattr(owner, "NAMED", ()), getattr(owner, "MEASURED", ())
         for name in (*attributes(owner), *(each for each in getattr(thing, "__dict__", ()) if each not in rare)):
             try:
                 value = getattr(thing, name)
             except AttributeError:  # never set
                 continue
-            if name in names:
-                kind = None
-            elif (kind := NUMBERS.get(type(value))) is None and value is not None:
-                kind = self.kind(value, (owner, name))
+            kind: Any = None
+            if name in named and value:
+                kind = Named(tuple(sorted(value)), tuple(len(value[each]) for each in sorted(value)))
+            elif name in measured:
+                kind = Measured()
+            elif name not in names and value is not None:
+                kind = NUMBERS.get(type(value)) or self.kind(value, (owner, name))
             if kind is not None:
                 fields[name] = kind
             elif isinstance(thing, Law) and isinstance(value, str | dict) and len(value) < LONG:
                 fixed[name] = value
-            elif value is None or name in names or (isinstance(value, list | tuple) and not value):
+            elif value is None or name in names or name in named or (isinstance(value, list | tuple) and not value):
                 fixed[name] = value[:0] if isinstance(value, list) else value  # it may be filled later
         key = (owner, tuple(fields.items()), repr(fixed) if fixed else "")
         layout = LAYOUTS.get(key)
@@ -172,16 +197,20 @@ class Layouts:
 class Image:
     """Objects stored in memory, for as long as compiled functions work on them."""
 
-    def __init__(self, roots: Sequence[tuple[Any, RecordLayout]], words: int = 1 << 12) -> None:
+    def __init__(
+        self, roots: Sequence[tuple[Any, RecordLayout]], words: int = 1 << 12, measures: list[str] | None = None
+    ) -> None:
         """Store `roots`, each with its layout, and all objects that they lead to.
 
         Args:
             words: About as many as they take.
+            measures: Names of measures, to which others are added.
 
         Raises:
             TypeError: If an object is not as its layout says.
         """
         self.roots, self._size = roots, words
+        self.measures = [] if measures is None else measures
         while not self._store():
             self._size *= 2
 
@@ -192,7 +221,7 @@ class Image:
         """Read the values of all objects that can change back."""
         memory = self.memory
         for thing, layout, at in self.changing:
-            layout.load(thing, memory, at)
+            layout.load(thing, self, at)
         for items, kind, at in self._lists:
             items[:] = _items(memory, at, len(items), kind)
 
@@ -227,11 +256,26 @@ class Image:
         at = self.take(thing, layout.words)
         try:
             layout.store(self, thing, at)
-        except (struct.error, AttributeError) as error:
+        except (struct.error, AttributeError, LookupError) as error:
             raise TypeError(f"{layout.owner.__name__} has an attribute that has changed its type: {error}") from error
         if not layout.frozen:
             self.changing.append((thing, layout, at))
         return self._base + at
+
+    def measured(self, values: Mapping[str, float]) -> list[float]:
+        """Measures as numbers; raises IndexError for too many."""
+        found, known = [0.0] * (1 + MEASURES), 0
+        for name, value in values.items():
+            if name not in self.measures:
+                self.measures.append(name)
+            k = self.measures.index(name)
+            found[1 + k] = value
+            known |= 1 << k
+        return [float(known), *found[1:]]
+
+    def as_measures(self, known: float, *values: float) -> dict[str, float]:
+        """Measures by name."""
+        return {name: values[k] for k, name in enumerate(self.measures) if int(known) >> k & 1}
 
     def put_items(self, items: Any, kind: Items) -> tuple[int, int]:
         """Store a list unless it is there already; returns its address and its length."""
@@ -262,7 +306,7 @@ class _FullError(Exception):
 
 def _code(kind: Any) -> str:
     """Code of `struct` of the words of a kind."""
-    return "d" if kind == FLOAT or isinstance(kind, Floats) else "q"
+    return "d" if kind == FLOAT or isinstance(kind, Floats | Named | Measured) else "q"
 
 
 def _format(kind: Any) -> str:
@@ -288,6 +332,11 @@ def _storing(layout: RecordLayout) -> Callable[[Image, Any, int], None]:
             values.append(f"(known.get(id(thing.{name})) or image.put(thing.{name}, kind_{name}))")
         elif isinstance(kind, Items):
             values.append(f"*image.put_items(thing.{name}, kind_{name})")
+        elif isinstance(kind, Named):
+            values += [f"*thing.{name}[{each!r}]" for each in kind.names]
+            conditions.append(f"len(thing.{name}) == {len(kind.names)}")
+        elif isinstance(kind, Measured):
+            values.append(f"*image.measured(thing.{name})")
         else:
             values.append(f"*thing.{name}" if isinstance(kind, Floats) else f"thing.{name}")
     for name, value in layout.fixed.items():
@@ -304,7 +353,7 @@ def store(image, thing, at):
     return cast("Callable[[Image, Any, int], None]", _made(source, "store", pack=pack, **space))
 
 
-def _loading(layout: RecordLayout) -> Callable[[Any, memoryview, int], None]:
+def _loading(layout: RecordLayout) -> Callable[[Any, Image, int], None]:
     """Function that reads the numbers of an object back from a place in the memory of an image."""
     targets, statements, formats = list[str](), list[str](), list[str]()
     for name, kind in layout.fields.items():
@@ -312,17 +361,25 @@ def _loading(layout: RecordLayout) -> Callable[[Any, memoryview, int], None]:
             formats.append(f"{WORD * width(kind)}x")
             continue
         formats.append(_format(kind))
-        if isinstance(kind, Floats):
-            parts = [f"new_{name}_{k}" for k in range(kind.size)]
+        if isinstance(kind, Floats | Named | Measured):
+            parts = [f"new_{name}_{k}" for k in range(width(kind))]
             targets += parts
-            statements.append(f"thing.{name} = ({', '.join(parts)},)")
+            value = f"({', '.join(parts)},)"
+            if isinstance(kind, Measured):
+                value = f"image.as_measures{value}"
+            elif isinstance(kind, Named):
+                rest = iter(parts)
+                sized = zip(kind.names, kind.sizes, strict=True)
+                tuples = [f"{each!r}: ({' '.join(f'{next(rest)},' for _ in range(size))})" for each, size in sized]
+                value = f"{{{', '.join(tuples)}}}"
+            statements.append(f"thing.{name} = {value}")
         else:
             targets.append(f"new_{name}")
             statements.append(f"thing.{name} = new_{name}" + " != 0" * (kind == BOOL))
     unpack = struct.Struct("".join(formats)).unpack_from
-    got = f"({', '.join(targets)},) = unpack(memory, at)" if targets else "pass"
-    source = "\n    ".join(["def load(thing, memory, at):", got, *statements])
-    return cast("Callable[[Any, memoryview, int], None]", _made(source, "load", unpack=unpack))
+    got = f"({', '.join(targets)},) = unpack(image.memory, at)" if targets else "pass"
+    source = "\n    ".join(["def load(thing, image, at):", got, *statements])
+    return cast("Callable[[Any, Image, int], None]", _made(source, "load", unpack=unpack))
 
 
 def _made(source: str, name: str, **space: Any) -> Any:

@@ -364,7 +364,7 @@ class VirtualRun:
             ended=self._tick * self.dt - begin,
             memory=self._memory.columns(),
             measures=self._measures.columns(),
-            velocities=tuple(law is not None and law.control.velocity is not None for law in self._laws),
+            velocities=tuple(law is not None and law.gives_velocity for law in self._laws),
             incidents=tuple(
                 (row, each._replace(time=each.time - begin))
                 for row, each in sorted(incidents, key=lambda pair: pair[1].time)

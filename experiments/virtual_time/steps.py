@@ -12,12 +12,10 @@ from typing import Any, Final
 import numpy as np
 
 from agents.decision.goals import GoalComputer
-from agents.decision.neighbours import NO_WORDS
 from agents.decision.stepping import Words
 from agents.plugins.law import is_known
 from experiments.virtual_time.company import Ledger, Member
-from experiments.virtual_time.laws import MEASURES
-from experiments.virtual_time.records import Image
+from experiments.virtual_time.records import MEASURES, Image
 from twins.arrays import Array
 
 CALL: Final = ctypes.PYFUNCTYPE(ctypes.c_int64, ctypes.c_int64, ctypes.c_int64, ctypes.POINTER(ctypes.c_double))
@@ -28,54 +26,34 @@ class Steps:
 
     def __init__(self, members: Sequence[Member]) -> None:
         self._members = members
-        self._minds = [(each.mind, law) for each in members if each.mind and (law := each.robot.stepping)]
-        for mind, law in self._minds:
-            law.mind = mind
-        self._names = list[str]()  # names of measures
+        self._laws = [(each.row, law) for each in members if (law := each.robot.stepping) is not None]
+        self.measures = list[str]()  # names of measures
         self.error: BaseException | None = None  # error of a law, or interruption
         self.call = CALL(self._call)
         self.address = ctypes.cast(self.call, ctypes.c_void_p).value or 0
 
-    def begin(self, measures: list[str]) -> None:
-        """Begin a stretch; `measures` are names of measures, to which others may be added."""
-        self._names, self.error = measures, None
-        for mind, law in self._minds:
-            mind.called_back = False
-            mind.take(law, measures)
-            for way in mind.ways:
-                way.said.hear(way.neighbour.said)
-
     def board(self, image: Image) -> None:
         """Find the records of a stretch; what is called back can be undone."""
-        rare = [each for each in self._members if each.mind or each.robot.goals.changes_shape]
-        self._rare = {image.address(each.robot.goals): each for each in rare}
-        if not rare:
-            return
-        self._image, self._begun = image, image.words.copy()
-        self._places = {id(thing): (thing, layout, at) for thing, layout, at in image.changing}
-        things = [thing for _, law in self._minds for thing in (law, law.speech) if thing is not None]
-        self._kept = [(thing, thing.__dict__.copy()) for thing in things]
-        self._said = [(way.neighbour, way.neighbour.said) for mind, _ in self._minds for way in mind.ways]
+        self._image, self._begun, self.error = image, None, None
+        rare = [each.robot.goals for each in self._members if each.robot.stepping or each.robot.goals.changes_shape]
+        self._rare = {image.address(each): each for each in rare}
+        if rare:
+            self._begun = image.words.copy()
+            self._places = {id(thing): (thing, layout, at) for thing, layout, at in image.changing}
 
     def _call(self, address: int, which: int, given: Any) -> int:  # noqa: ANN401 - an array of C
         """A rare function of the goals of a robot; returns 1 after an error."""
         try:
-            member = self._rare[address]
-            goals, mind = member.robot.goals, member.mind
-            parts = [*goals.rare_parts(), *(mind.parts() if mind else ())]
-            records = [self._places[id(each)] for each in parts if id(each) in self._places]
+            goals = self._rare[address]
+            records = [self._places[id(each)] for each in goals.rare_parts() if id(each) in self._places]
             for thing, layout, at in records:
-                layout.load(thing, self._image.memory, at)
+                layout.load(thing, self._image, at)
             if GoalComputer.RARE[which] == "reshape":
                 elapsed, x, y, z, t = given[:5]
                 goals.reshape(elapsed, (x, y, z), t)
-            elif mind is not None and goals.stepping is not None:
-                for way in mind.ways:
-                    way.neighbour.said = way.said.known() or NO_WORDS
+            else:
                 t, x, y, z, vx, vy, vz, yaw, start = given[:9]
                 goals.step(t, (x, y, z), (vx, vy, vz), yaw, start)
-                mind.take(goals.stepping, self._names)
-                mind.called_back = True
             for thing, layout, at in records:
                 layout.store(self._image, thing, at)
         except BaseException as error:  # noqa: BLE001 - C cannot pass it on: the stretch is flown again in Python
@@ -83,40 +61,27 @@ class Steps:
             return 1
         return 0
 
-    def leave(self) -> None:
-        """The robots have all that their laws remember, and all words."""
-        for mind, law in self._minds:
-            mind.give(law, self._names)
-            for way in mind.ways:
-                way.neighbour.said = way.said.known() or NO_WORDS
-
     def undo(self) -> None:
         """Take all that was called back in a stretch back, and what was read from the records for it."""
-        if not self._rare:
-            return
-        for thing, before in self._kept:
-            thing.__dict__.clear()
-            thing.__dict__.update(before)
-        self._image.words[:] = self._begun
-        self._image.load()
-        for neighbour, said in self._said:
-            neighbour.said = said
+        if self._begun is not None:
+            self._image.words[:] = self._begun
+            self._image.load()
 
     def columns(self, ledger: Ledger) -> tuple[dict[str, Array], dict[str, Array]]:
         """Memory (K, N, k) and measures (K, N) of all robots at the samples of a stretch, by name."""
-        if not self._minds:
+        if not self._laws:
             return {}, {}
         wide, rows = ledger.memory + 1 + MEASURES, len(self._members)
-        table = np.frombuffer(ledger.minds)[: ledger.sample * rows * wide].reshape(-1, rows, wide)
+        table = np.frombuffer(ledger.laws)[: ledger.sample * rows * wide].reshape(-1, rows, wide)
         measured = table[:, :, ledger.memory].astype(np.intp)
         measures, memory = dict[str, Array](), dict[str, Array]()
-        for k, name in enumerate(self._names):
+        for k, name in enumerate(self.measures):
             there = (measured >> k & 1).astype(bool)
             if there.any():
                 measures[name] = np.where(there, table[:, :, ledger.memory + 1 + k], np.nan)
-        for mind, _ in self._minds if ledger.memory else ():
-            row, begin = next(each.row for each in self._members if each.mind is mind), 0
-            for name, values in mind.memory.all().items():
+        for row, law in self._laws if ledger.memory else ():
+            begin = 0
+            for name, values in sorted(law.memory.items()):
                 blank = np.full((ledger.sample, rows, len(values)), np.nan)
                 memory.setdefault(name, blank)[:, row] = table[:, row, begin : begin + len(values)]
                 begin += len(values)

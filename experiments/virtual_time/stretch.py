@@ -12,12 +12,11 @@ from typing import Any, Final, Protocol
 import msgspec
 import numpy as np
 
-from agents.decision.goals import GoalComputer
 from agents.decision.lifecycle import READY
 from agents.plugins.planners import NO_TARGET, Itinerary
 from agents.robot import Robot
 from experiments.definition.plan import Plan
-from experiments.virtual_time import company, laws, machine
+from experiments.virtual_time import company, machine
 from experiments.virtual_time.company import AT_END, Crew, Ledger, Member, Planned, Way
 from experiments.virtual_time.network import VirtualNetwork
 from experiments.virtual_time.records import Image, Layouts, RecordLayout
@@ -112,6 +111,8 @@ def possible(flight: Flown) -> bool:
     says = [robot.stepping.says for robot in flight.robots if robot.stepping is not None]
     if not flight.lonely or not machine.works() or any(each != flight.network.says for each in says):
         return False
+    if not all(values for robot in flight.robots if robot.stepping for values in robot.stepping.memory.values()):
+        return False
     return all(robot.guidance is None for robot in flight.robots)
 
 
@@ -154,10 +155,8 @@ class Stretches:
         self._steps, self._ways = Steps(self._members), list[Way]()
         for (robot, k), delay in zip(network.receivers, network.delays, strict=True):
             sender = robot.neighbours.all[k]
-            way = Way(sender, delay, ROOM + round(delay * rates.pose_hz), says)
+            way = Way(sender, delay, ROOM + round(delay * rates.pose_hz), sum(says.values()))
             self._members[sender.sender].ways.append(way)
-            if robot.stepping is not None:
-                robot.stepping.mind.ways.append(way)
             self._ways.append(way)
         self._plans: dict[int, Planned] = {}
         self.flown, self.refusal = 0, ""
@@ -190,7 +189,6 @@ class Stretches:
         if last < 0:
             flight.network.take_back(before)
             return k, AT_END
-        self._steps.leave()
         if last - k < LEAST:
             self._paused_until, self._pause = last + self._pause, min(2 * self._pause, LONGEST_PAUSE)
         else:
@@ -231,10 +229,10 @@ class Stretches:
 
     def _image(self, prepared: Prepared, ledger: Ledger) -> Image | None:
         """All objects in memory, None if they are not of these layouts."""
-        self._steps.begin(prepared.driver.program.measures)
+        self._steps.measures = prepared.driver.program.measures
         crew = Crew([[self._members[row] for row in rows] for rows in prepared.rows], ledger)
         try:
-            image = Image([(crew, prepared.layout)], prepared.words)
+            image = Image([(crew, prepared.layout)], prepared.words, self._steps.measures)
         except TypeError as error:
             self.refusal = str(error)
             return None
@@ -243,7 +241,6 @@ class Stretches:
 
     def _new(self, ledger: Ledger) -> Prepared:
         """Layouts and compiled loop of these robots; raises OutsideError, or NoCompilerError, if there is none."""
-        self._steps.begin([])
         layouts, groups = Layouts(), dict[RecordLayout | None, list[int]]()
         for member in self._members:
             layouts.of(member)
@@ -305,7 +302,7 @@ def driver(crew: RecordLayout, groups: int, names: Sequence[str], *, often: bool
     known = DRIVERS.get(crew)
     numbers = {name: number for number, name in enumerate(names)}
     if known is None or known.program.changed() or often > known.often or known.program.names != numbers:
-        DRIVERS[crew] = known = CompiledLoop(Program({GoalComputer.step: laws.step}, numbers), often)
+        DRIVERS[crew] = known = CompiledLoop(Program(numbers), often)
 
         def each(text: str) -> str:
             return "; ".join(text.format(f"crew.g{k}") for k in range(groups))

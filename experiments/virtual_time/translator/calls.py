@@ -14,12 +14,12 @@ from functools import partial
 from types import FunctionType
 from typing import Any, Final
 
+from agents.decision.neighbours import Neighbour
 from agents.decision.stepping import REST
 from agents.plugins.law import Control, NeighbourView, RobotFacts, View
 from agents.vectors import UNKNOWN
-from experiments.virtual_time.laws import MEASURES, as_dictionary, keep, numbers, robot_name
-from experiments.virtual_time.records import FLOAT, Items, RecordLayout
-from experiments.virtual_time.translator.expressions import NAMED, Expressions
+from experiments.virtual_time.records import FLOAT, MEASURES, Items, Measured, RecordLayout, numbers
+from experiments.virtual_time.translator.expressions import GIVEN, NAMED, Expressions
 from experiments.virtual_time.translator.kinds import (
     BOOLEAN,
     DOUBLE,
@@ -46,7 +46,7 @@ MATH: Final = {  # functions of `math`, with the types of their values
 }  # fmt: skip
 BUILTINS: Final = {"abs", "bool", "float", "int", "len", "max", "min", "round"}
 NEW_SUMS: Final = (3, 12)  # Python that adds floats in another way
-OF_RECORDS: Final = (as_dictionary, keep, numbers, robot_name)
+NUMBER_OF: Final[dict[type, str]] = {RobotFacts: "number", Neighbour: "sender"}  # of a name
 
 
 class Calls(Expressions):
@@ -59,14 +59,15 @@ class Calls(Expressions):
         layout, name = thing.type, node.attr
         if isinstance(layout, Several) and name in layout.names and layout.owner is not dict:
             return self.members(thing)[layout.names.index(name)]
-        if getattr(layout, "owner", None) is RobotFacts and name == "name":
-            return Value(NAME, f"{thing.text}->number")
+        if name == "name" and (number := NUMBER_OF.get(getattr(layout, "owner", tuple))):
+            return Value(NAME, f"{thing.text}->{number}")
         if not isinstance(layout, RecordLayout):
             raise self.error(node, f"an attribute of {listed(layout)}")
         if name in layout.fields:
             return Value(type_of(layout.fields[name]), f"{thing.text}->{mangled(name)}")
         if name in layout.fixed:
-            return self.known(layout.fixed[name], node)
+            empty = name in getattr(layout.owner, "NAMED", ())
+            return self.with_names(dict, {}) if empty else self.known(layout.fixed[name], node)
         found = self._program.look(partial(inspect.getattr_static, layout.owner, name, ...))
         if isinstance(found, property) and isinstance(found.fget, FunctionType):
             return self.call(found.fget, [thing], {}, node)
@@ -79,7 +80,7 @@ class Calls(Expressions):
         found = self.named(ast.unparse(node.func)) if is_name else self.of_module(node.func)
         if found is ... and isinstance(node.func, ast.Attribute):  # a method
             owner = [node.func.value]
-        elif not isinstance(found, FunctionType) or found in OF_RECORDS:
+        elif not isinstance(found, FunctionType) or found is numbers:
             return self.builtin(found, node)
         given, by_name = self.given(node, owner)
         if owner and isinstance(node.func, ast.Attribute):
@@ -88,6 +89,8 @@ class Calls(Expressions):
                     raise self.error(node, "`get` without a default")
                 return self.entry(given[0], given[1], given[2], node)
             of = getattr(given[0].type, "owner", None)
+            if node.func.attr in getattr(of, "CHECKS", ()):  # the types of values are checked here
+                return given[1]
             found = self._program.look(partial(inspect.getattr_static, of, node.func.attr, None))
         if not isinstance(found, FunctionType):
             raise self.error(node, f"a call of {ast.unparse(node.func)}")
@@ -128,7 +131,7 @@ class Calls(Expressions):
         if name not in program.called_back:
             try:
                 self.emit("rooms = 0;")
-                return self.call_quiet(program.instead.get(function, function), given, by_name, node)
+                return self.call_quiet(function, given, by_name, node)
             except OutsideError as error:
                 del self._lines[mark:]
                 program.called_back[name] = str(error)
@@ -175,11 +178,12 @@ class Calls(Expressions):
         name, called = getattr(found, "__name__", ""), ast.unparse(node.func)
         if found in (View, NeighbourView, Control):
             return self.made(found, node)
-        if found is robot_name:
-            number: Value = self.visit(node.args[0])
-            return number._replace(type=NAME)
-        if found in OF_RECORDS:
-            return self.of_variables(name, self.several(node.args), node)
+        if found is numbers:
+            return self.all_numbers(self.visit(node.args[0]), node)
+        if found is dict and len(node.args) == 1:
+            return self.floats_of(self.visit(node.args[0]), node)
+        if found is tuple and len(node.args) == 1 and ast.unparse(node.args[0]).startswith("map("):
+            return self.mapped(node.args[0], node)
         if found in (math.hypot, math.dist):
             return self.length(found, node)
         if found is float and len(node.args) == 1 and isinstance(node.args[0], ast.JoinedStr):
@@ -211,6 +215,14 @@ class Calls(Expressions):
             return Value(WHOLE, f"py_abs_i({whole.text})") if name == "abs" else whole
         return Value(DOUBLE if name == "abs" else WHOLE, f"py_{name}({first.text})")
 
+    def mapped(self, node: Any, call: ast.Call) -> Value:
+        """`tuple(map(function, values))` of a tuple."""
+        function = self.named(ast.unparse(node.args[0]))
+        if len(node.args) != 2 or not isinstance(function, FunctionType):
+            raise self.error(call, "a call of tuple")
+        parts = [self.call(function, [each], {}, node) for each in self.parts(self.visit(node.args[1]), node)]
+        return Value(Several(tuple(each.type for each in parts)), "", ..., parts)
+
     def made(self, owner: Any, node: ast.Call) -> Value:
         """An object that is a value."""
         places, by_name = self.given(node)
@@ -231,22 +243,21 @@ class Calls(Expressions):
         memory, measures = given.get("memory", nothing), given.get("measures", nothing)
         values = {"memory": self.floats_of(memory, node)}
         gives = measured = 0
-        for k, (name, other) in enumerate((("velocity", REST), ("goal", UNKNOWN)), 1):
+        for k, (name, other) in enumerate(zip(GIVEN[1:], (REST, UNKNOWN), strict=True), 1):
             value = given.get(name, constant(None))
             gives = gives if value.type == NONE else k if gives == 0 else 3
             values[name] = self.floats(constant(other) if value.type == NONE else value, node)
-        numbers, known = [constant(0.0)] * MEASURES, self._program.measures
+        measure, known = [constant(0.0)] * MEASURES, self._program.measures
         for name, value in zip(measures.type.names, self.members(measures), strict=True):
             if name not in known:
                 known.append(name)
             if known.index(name) >= MEASURES or gives > 2 or len(values["velocity"].type.parts) != 3:
                 raise self.error(node, f"more than {MEASURES} measures, or a velocity beside a goal")
-            numbers[known.index(name)] = self.number(value, DOUBLE, node)
+            measure[known.index(name)] = self.number(value, DOUBLE, node)
             measured |= 1 << known.index(name)
         values["yaw"] = self.number(given.get("yaw", constant(math.nan)), DOUBLE, node)
-        kinds = tuple(each.type for each in numbers)
-        values |= {"measures": Value(Several(kinds), "", ..., numbers), "gives": constant(gives)}
-        return self.with_names(Control, values | {"measured": constant(measured)})
+        values["measures"] = Value(type_of(Measured()), "", ..., [constant(float(measured)), *measure])
+        return self.with_names(Control, values | {"gives": constant(gives)})
 
     def floats(self, value: Value, node: ast.AST) -> Value:
         """A tuple of floats."""
@@ -260,21 +271,13 @@ class Calls(Expressions):
         members = zip(value.type.names, self.members(value), strict=True)
         return self.with_names(dict, {name: self.floats(each, node) for name, each in members})
 
-    def of_variables(self, name: str, given: Sequence[Value], node: ast.AST) -> Value:
-        """Functions on the record of variables, see `experiments.virtual_time.laws`."""
-        (layout, text, *_), names = given[0], sorted(given[0].type.owner.NAMES)
-        fields = [Value(type_of(layout.fields[each]), f"{text}->{each}") for each in map(layout.owner.slot, names)]
-        if name == "numbers":
-            items = Items(FLOAT)
-            return Value(items, f"(({self._program.c(items)}){{(double *){text}, {layout.words * bool(names)}}})")
-        stored = self.with_names(dict, dict(zip(names, fields, strict=True)))
-        if name == "as_dictionary":
-            return stored
-        values = self.saved(self.floats_of(given[1], node))
-        self.of_type(values, stored.type, node)
-        for field, value in zip(fields, self.members(values), strict=True):
-            self.emit(f"{field.text} = {self.one(value)};")
-        return constant(None)
+    def all_numbers(self, value: Value, node: ast.AST) -> Value:
+        """All numbers of a dictionary, as a list where they stand; see `numbers`."""
+        if not isinstance(value.type, Several) or value.type.owner not in (dict, Measured):
+            raise self.error(node, f"numbers of {listed(value.type)}")
+        items, count = Items(FLOAT), f"(sizeof {value.text} / 8)" if value.type.parts else "0"
+        at = f"(double *)&{value.text}" if value.type.parts else "(double *)0"
+        return Value(items, f"(({self._program.c(items)}){{{at}, {count}}})")
 
     def length(self, found: Any, node: ast.Call) -> Value:
         """`hypot` and `dist`: Python's own sums, which it changed."""

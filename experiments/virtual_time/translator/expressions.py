@@ -9,6 +9,7 @@ from functools import partial
 from types import FunctionType, ModuleType
 from typing import Any, Final, Protocol
 
+from agents.plugins.law import Control
 from experiments.virtual_time.records import FLOAT, INT, Items, RecordLayout
 from experiments.virtual_time.translator.kinds import (
     BOOLEAN,
@@ -42,6 +43,7 @@ DIVISIONS: Final = {  # function of `arithmetic.c` by operator and type
     (ast.FloorDiv, DOUBLE): "py_floor_over", (ast.FloorDiv, WHOLE): "py_floor_i", (ast.Pow, DOUBLE): "py_power",
     (ast.LShift, WHOLE): "py_left", (ast.RShift, WHOLE): "py_right",
 }  # fmt: skip
+GIVEN: Final = ("", "velocity", "goal")  # what a `Control` gives, by number
 SMALL: Final = 1 << 31  # a sum with a constant below this needs no check
 NAMED: Final[dict[type, str]] = {  # constructs outside of the subset
     ast.JoinedStr: "an f-string", ast.Dict: "a dictionary", ast.Set: "a set", ast.List: "a list", ast.Try: "try",
@@ -56,7 +58,6 @@ class Translated(Protocol):
 
     names: Mapping[str, int]
     measures: list[str]
-    instead: Mapping[Any, Any]
     called_back: dict[str, str]
 
     def c(self, kind: Any) -> str:
@@ -229,6 +230,8 @@ class Expressions(ast.NodeVisitor):
             kept = parts[slice(*(None if each is None else ast.literal_eval(each) for each in ends))]
             return Value(Several(tuple(each.type for each in kept)), "", ..., kept)
         items, k = self.several([node.value, node.slice])
+        if isinstance(items.constant, Mapping) and k.constant in items.constant:
+            return self.known(items.constant[k.constant], node)
         if isinstance(k.type, TextType) and isinstance(items.type, Several) and items.type.owner is dict:
             if k.constant not in items.type.names:
                 raise self.error(node, f"{k.constant}, which a dictionary lacks")
@@ -368,6 +371,11 @@ class Expressions(ast.NodeVisitor):
             return self.joined(ast.copy_location(whole, node), self.visit)
         (a, b), op = self.several(values), type(node.ops[0])
         identity, word = op in (ast.Is, ast.IsNot), COMPARISONS.get(op, "")
+        if b.type == NONE and word and isinstance(node.left, ast.Attribute):  # a velocity or goal may be left out
+            of = self.visit(node.left.value)
+            if getattr(of.type, "owner", None) is Control and node.left.attr in GIVEN:
+                gives = self.members(of)[of.type.names.index("gives")]
+                return Value(BOOLEAN, f"({gives.text} {'!=' if word == '==' else '=='} {GIVEN.index(node.left.attr)})")
         if NONE in (a.type, b.type) and word:
             return constant((a.type == b.type) == (word == "=="))
         if isinstance(a.type, TextType) and isinstance(b.type, TextType) and op in (ast.Eq, ast.NotEq):

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final, NamedTuple
 
-from experiments.virtual_time.records import BOOL, FLOAT, INT, Floats, Items, RecordLayout
+from experiments.virtual_time.records import BOOL, FLOAT, INT, Floats, Items, Measured, Named, RecordLayout
 
 LEAVE: Final = "@leave"  # stands for the return of a function at an error
 # types: numbers, by C's names, and what has no value; that of an object is its layout, that of a list its `Items`
@@ -69,8 +69,10 @@ class Value(NamedTuple):
 
 def type_of(kind: Any) -> Any:
     """Type of a value of a record."""
-    if isinstance(kind, Floats):
-        return Several((DOUBLE,) * kind.size)
+    if isinstance(kind, Floats | Measured):
+        return Several((DOUBLE,) * kind.size, (), type(kind) if isinstance(kind, Measured) else tuple)
+    if isinstance(kind, Named):
+        return Several(tuple(Several((DOUBLE,) * size) for size in kind.sizes), kind.names, dict)
     return BOOLEAN if kind == BOOL else STORED[kind] if isinstance(kind, str) else kind
 
 

@@ -78,9 +78,9 @@ class Iteration(NamedTuple):
 class Program:
     """Functions in C, as they are asked for."""
 
-    def __init__(self, instead: Mapping[Any, Any] | None = None, names: Mapping[str, int] | None = None) -> None:
-        """Take functions that are compiled `instead` of others, and numbers of robots by their `names`."""
-        self.instead, self.names = instead or {}, names or {}
+    def __init__(self, names: Mapping[str, int] | None = None) -> None:
+        """Take numbers of robots by their `names`."""
+        self.names = names or {}
         self.called_back: dict[str, str] = {}  # rare functions that stay in Python, with the reasons
         self.measures: list[str] = []  # names of the measures of all laws
         self._numbers = count()
@@ -301,6 +301,8 @@ class Walk(Calls):
         together = isinstance(node, ast.Call) and function in ("zip", "enumerate")
         values = self.several(node.args) if together and isinstance(node, ast.Call) else [self.visit(node)]
         if not together and isinstance(values[0].type, Several):
+            if isinstance(values[0].constant, Mapping):
+                return [constant(each) for each in values[0].constant]
             parts = self.parts(values[0], node)
             if not parts or parts[0].type not in (DOUBLE, WHOLE):
                 return parts
@@ -380,6 +382,22 @@ class Walk(Calls):
         self._lines[mark:mark] = [room, f"if (fault) {LEAVE}"]
         return Value(made, name)
 
+    def visit_DictComp(self, node: ast.DictComp) -> Value:
+        """A dictionary with the names of a table of constants."""
+        (generator,) = node.generators if len(node.generators) == 1 else [None]
+        if generator is None or generator.ifs or not isinstance(generator.target, ast.Name):
+            raise self.error(node, "a dictionary with a condition")
+        names = self.iteration(generator.iter, node)
+        if isinstance(names, Iteration) or ast.unparse(node.key) != generator.target.id:
+            raise self.error(node, "a dictionary by something else than names")
+        before, values = dict(self._locals), dict[str, Value]()
+        for name in names:
+            self.bind(generator.target, name)
+            values[name.constant] = self.saved(self.visit(node.value))
+        self._locals = before
+        self._set.discard(generator.target.id)
+        return self.with_names(dict, {name: values[name] for name in sorted(values)})
+
     def builtin(self, found: Any, node: ast.Call) -> Value:
         """Also `any`, `all`, `sum`, `min` and `max` of a generator or a list."""
         name, given = getattr(found, "__name__", ""), node.args
@@ -447,6 +465,8 @@ class Walk(Calls):
                 return
         elif isinstance(target, ast.Attribute):
             thing = self.visit(target.value)
+            if value.type == Several((), (), dict) and target.attr in getattr(thing.type, "fixed", ()):
+                return
             if not (isinstance(thing.type, RecordLayout) and target.attr in thing.type.fields):
                 raise self.error(target, f"an attribute {target.attr} that is none or is not there")
             kind, into = type_of(thing.type.fields[target.attr]), f"{thing.text}->{mangled(target.attr)}"

@@ -147,7 +147,7 @@ def test_words_on_unknown_reads_change_nothing():
         assert words.startswith(": Odd reads link.bearing") == asks
         assert "view.target" not in words
         bench.step(0.2, hear)
-        speeds.append(goals.stepping.control.velocity[:2])
+        speeds.append(goals.stepping.velocity[:2])
     assert speeds[0] == speeds[1] == pytest.approx((0.1, 0.0), abs=1e-6)
 
 

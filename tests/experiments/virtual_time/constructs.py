@@ -267,6 +267,23 @@ def dictionaries(x, y, i):
     return part(table, "a"), table["b"], part({"a": (y, 0.5)}, name="a")
 
 
+def dictionaries_by_names(x, y):
+    """comprehensions of, and loops over, the names of a table of constants; `dict`, `tuple(map(function, values))`"""
+    table, total, name = {"b": (x,), "a": (y, 0.5)}, 0.0, 7.0
+    made = {name: tuple(map(larger, table[name])) for name in METRES}
+    for each in METRES:  # noqa: PLC0206 - a loop over pairs is outside of the subset
+        for value in dict(made)[each]:
+            total += value * METRES[each]
+    return total, made["a"], made["b"], name
+
+
+METRES = {"b": 2.0, "a": 0.1}
+
+
+def larger(x):
+    return 1.1 * x + 1.0
+
+
 def part(table, name):
     return table[name][1] if name == "a" else table[name][0]
 

@@ -5,7 +5,7 @@ import shutil
 import sys
 from dataclasses import replace
 from importlib import import_module
-from math import sqrt
+from math import inf, sqrt
 from pathlib import Path
 from types import FunctionType
 from typing import ClassVar
@@ -15,13 +15,14 @@ import pytest
 from agents.body.interface import Disturbance, Jitter
 from agents.body.kinds import KINDS
 from agents.body.limits import Safety
+from agents.decision.stepping import Speech, Stepping
 from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_RELATIVE
 from agents.plugins import registry
-from agents.plugins.law import Control, Law
+from agents.plugins.law import Control, Law, View
 from agents.plugins.laws import Gradient
 from agents.plugins.registry import AVOIDANCES, LAWS, PREDICTORS, TRIGGERS, PluginError
 from agents.plugins.triggers import Trigger
-from agents.vectors import UNKNOWN, clamp, norm
+from agents.vectors import UNKNOWN, ZERO, clamp, norm
 from experiments.definition.experiment import (
     ChangeTable,
     ChannelTable,
@@ -162,7 +163,17 @@ def test_every_law_that_remembers(monkeypatch, name):
     """Its steps are compiled, or called back in Python between ticks that are. A user's laws are among them."""
     monkeypatch.setattr(stretch, "DRIVERS", {})
     monkeypatch.setattr(stretch, "RECENT", {})
-    law, circle = plugin(LAWS, name), {"kind": "circle", "radius": 0.3, "period_s": 9.0}
+    experiment, change = remembering(plugin(LAWS, name))
+    assert same(experiment, change=change)[1] > 200
+    called_back = [each for loop in stretch.DRIVERS.values() for each in loop.program.called_back]
+    assert name not in STEPS or not called_back or sys.version_info >= NEW_SUMS
+    if not name.startswith("m"):
+        same(experiment, change=change, lean=True, seed=2)
+
+
+def remembering(law):
+    """Experiment of three robots, of which A follows a circle, and change of its robots, which have this law."""
+    circle = {"kind": "circle", "radius": 0.3, "period_s": 9.0}
     starts = {"A": [-0.4, 0.0], "B": [0.4, 0.1], "C": [-0.3, 0.8]}
     robots = {each: RobotTable(kind="khepera4", start=start) for each, start in starts.items()}
     links = Formation(links={"A > B": 0.8, "A > C": 0.8, "B - C": 0.9})
@@ -176,11 +187,52 @@ def test_every_law_that_remembers(monkeypatch, name):
         robots=robots, formation=links, duration_s=3.0, channel=ChannelTable(delay_s=0.03),
         timeline=[LegTable(at_s=0.5, robot="A", plan=circle)],
     )  # fmt: skip
-    assert same(experiment, change=change)[1] > 200
-    called_back = [each for loop in stretch.DRIVERS.values() for each in loop.program.called_back]
-    assert name not in STEPS or not called_back or sys.version_info >= NEW_SUMS
-    if not name.startswith("m"):
-        same(experiment, change=change, lean=True, seed=2)
+    return experiment, change
+
+
+def faster(self, view):
+    """`Stepping.step`, changed."""
+    control = self.rehearse(view)
+    x, y, z = ZERO if control.velocity is None else control.velocity
+    self.gives_velocity, self.velocity = control.velocity is not None, (1.5 * x, 1.5 * y, z)
+    self.memory, self.measures = control.memory, control.measures
+    self.stepped = self.tick
+    if self.speech is not None:
+        self.speech.update(self.memory)
+
+
+def hoarse(self, memory):
+    """`Speech.update`, changed."""
+    self.now = {name: tuple(map(halved, memory[name])) for name in self.metres}
+    self.stepped, self.current, self.change = True, False, inf
+
+
+def halved(value):
+    return 0.5 * value
+
+
+def turned(self, neighbours, position, velocity, yaw, target, speed, leads):  # noqa: PLR0917 - as `Stepping.view`
+    """`Stepping.view`, changed."""
+    said = {} if self.speech is None else self.speech.said
+    return View(
+        self.facts, said, neighbours, self.tick * self.tick_s, position, velocity, yaw + 0.1, target, speed, self.scan,
+        self.deviation, leads, self.moves, step_s=2.0 * self.length(),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("owner", "name", "other"), [(Stepping, "step", faster), (Speech, "update", hoarse), (Stepping, "view", turned)]
+)
+def test_compiled_steps_are_those_of_the_process(monkeypatch, owner, name, other):
+    """One source: what is changed there changes compiled ticks and plain ones alike."""
+    made = remembering(plugin(LAWS, "leader-observer"))
+    before, ticks = same(made[0], change=made[1])
+    monkeypatch.setattr(owner, name, other)
+    after, changed_ticks = same(made[0], change=made[1])
+    assert min(ticks, changed_ticks) > 200
+    assert not any(loop.program.called_back for loop in stretch.DRIVERS.values()) or sys.version_info >= NEW_SUMS
+    ends = [(log.position[-1], {name: each[-1] for name, each in log.memory.items()}) for log in (before, after)]
+    assert not alike(*ends)
 
 
 class Growing(Trigger, frozen=True):
