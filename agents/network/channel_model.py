@@ -11,7 +11,7 @@ import hashlib
 from collections.abc import Sequence
 from heapq import heapify, heappop, heappush
 from math import inf, isnan, log1p, nan
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, ClassVar, Final
 
 import msgspec
 from msgspec import Meta
@@ -25,6 +25,7 @@ AtLeastOne = Annotated[float, Meta(ge=1)]
 # odd step, and a mixer behind it: here the counter is given, not kept.
 _WORD: Final = 0xFFFFFFFFFFFFFFFF
 _STEP: Final = 0x9E3779B97F4A7C15
+_UNIT: Final = 2.0**-53
 _MIXERS: Final = (0xBF58476D1CE4E5B9, 0x94D049BB133111EB)
 
 
@@ -35,11 +36,11 @@ def key(seed: int, *names: str) -> int:
 
 
 def uniform(word: int, counter: int) -> float:
-    """Number in [0, 1), a multiple of 2⁻⁵³: one for each key `word` and counter."""
+    """Number in [0, 1), a multiple of 2⁻⁵³: one for each key `word` and counter. Quiet."""
     word = (word + _STEP * counter) & _WORD
     word = ((word ^ (word >> 30)) * _MIXERS[0]) & _WORD
     word = ((word ^ (word >> 27)) * _MIXERS[1]) & _WORD
-    return ((word ^ (word >> 31)) >> 11) * 2.0**-53
+    return ((word ^ (word >> 31)) >> 11) * _UNIT
 
 
 ROUNDING_S: Final = 2e-6  # stamps on the wire are whole microseconds, and sums of binary fractions miss the ticks
@@ -68,6 +69,7 @@ class LinkEffects(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 class Conditions(msgspec.Struct, frozen=True):
     """Conditions of a link: its `LinkEffects`, key, outages and duration."""
 
+    UNSIGNED: ClassVar = ("key",)
     delay: float = 0.0  # [s]
     jitter: float = 0.0  # [s]
     loss: float = 0.0  # share
@@ -101,7 +103,8 @@ class LinkChannel:
     """Carries samples over one link."""
 
     def __init__(self, conditions: Conditions) -> None:
-        self._conditions, self.delay = conditions, conditions.delay  # [s]
+        self._conditions = conditions
+        self.delay, self.jitter = conditions.delay, conditions.jitter  # [s]
         self.dropped = 0  # samples that were lost
         self._enter, self._leave = _thresholds(conditions)
         self._free = -inf  # time at which the link has sent all that it has taken [s]
@@ -109,7 +112,7 @@ class LinkChannel:
         self.plain = not (conditions.random or conditions.bandwidth < inf or conditions.outages)
 
     def arrival(self, seq: int, stamp: float, since: float, size: int) -> float:
-        """Time at which a sample that sets out at `stamp` [s] gets through; infinity if it is lost.
+        """Time at which a sample that sets out at `stamp` [s] gets through; infinity if it is lost. Quiet.
 
         `since` [s] is the time of `stamp` after the common start; NaN or negative before it is known or over. Before
         the common start, and after the end, no sample is lost and no link is too slow. A run begins only when all
@@ -168,7 +171,7 @@ class Channel:
     """Carries samples over several links."""
 
     def __init__(self, conditions: Sequence[Conditions]) -> None:
-        self._links = [LinkChannel(each) for each in conditions]
+        self.links = [LinkChannel(each) for each in conditions]
         # some link has a bandwidth: sizes must be given
         self.limited = any(each.bandwidth < inf for each in conditions)
         # nothing takes time on any link: a sample is received at once, or lost
@@ -179,19 +182,9 @@ class Channel:
         self._count = 0
 
     @property
-    def plain(self) -> bool:
-        """Whether all that a link does is to take its time, always the same."""
-        return all(link.plain for link in self._links)
-
-    @property
-    def delays(self) -> list[float]:
-        """Delay of each link [s]."""
-        return [link.delay for link in self._links]
-
-    @property
     def dropped(self) -> list[int]:
         """Samples that were lost on each link."""
-        return [link.dropped for link in self._links]
+        return [link.dropped for link in self.links]
 
     def send(
         self, link: int, sample: object, seq: int, stamp: float, *, start: float = inf, size: int = 0, now: float = -inf
@@ -202,10 +195,14 @@ class Channel:
         of stamps, infinity or NaN while it is not known. `now` is, at the receiver of a real network, the time of
         reception [s]: the time that it took counts towards the delay.
         """
-        arrival = self._links[link].arrival(seq, stamp, stamp - start, size)
+        arrival = self.links[link].arrival(seq, stamp, stamp - start, size)
         if arrival < inf:
-            self._count += 1
-            heappush(self._flying, (max(arrival, now), self._count, link, sample))
+            self.put(link, max(arrival, now), sample)
+
+    def put(self, link: int, arrival: float, sample: object) -> None:
+        """A sample is under way on a link, until its `arrival` [s]."""
+        self._count += 1
+        heappush(self._flying, (arrival, self._count, link, sample))
 
     def due(self, t: float) -> list[tuple[int, float, Any]]:
         """Samples that get through by `t` [s], in order of arrival: link, arrival [s] and sample."""

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Sequence
-from math import nan
+from math import inf, nan
 from typing import Final
 
 from agents.decision.neighbours import Neighbour
 from agents.decision.stepping import Speech, Stepping
-from agents.network.channel_model import ROUNDING_S
+from agents.network.channel_model import ROUNDING_S, LinkChannel
 from agents.plugins.planners import NO_TARGET
 from agents.robot import Robot
 from agents.vectors import Pose, Vector
@@ -30,39 +30,53 @@ AT_END, AT_PHASES, AT_HAZARDS = 0, 1, 2
 
 
 class Way:
-    """Link of constant delay, with the samples that are on it."""
+    """Link, with the samples that are on it."""
 
-    __slots__ = ("delay", "first", "neighbour", "next", "said", "samples", "size", "wide")
+    __slots__ = ("arrivals", "channel", "first", "neighbour", "next", "samples", "sent", "size", "wide")
 
     neighbour: Neighbour  # the sender, as the receiver knows it
-    delay: float  # [s]
+    channel: LinkChannel
     size: int  # samples for which there is room, and one more
     first: int  # index of the first sample
     next: int  # index behind the last one
     wide: int  # numbers of a sample
-    # time of arrival [s], number, stamp [s], position [m], velocity [m/s], yaw [rad] and words of each
+    sent: int  # count of the samples of a stretch
+    arrivals: array[float]  # time of arrival of each [s], infinity for those that are lost
+    # samples on the link, in the order of their arrivals: arrival [s], number, stamp [s], position [m], velocity [m/s],
+    # yaw [rad] and words of each
     samples: array[float]
 
-    def __init__(self, neighbour: Neighbour, delay: float, size: int, words: int) -> None:
+    def __init__(self, neighbour: Neighbour, channel: LinkChannel, size: int, words: int) -> None:
         """`words`: numbers beside a pose."""
-        self.neighbour, self.delay, self.size = neighbour, delay, size
-        self.first, self.next = 0, 0
+        self.neighbour, self.channel, self.size = neighbour, channel, size
+        self.first = self.next = self.sent = 0
+        self.arrivals = array("d")
         self.wide = SENT + words
         self.samples = array("d", (0.0,)) * (self.wide * size)
 
     def put(  # noqa: PLR0917 - quiet
-        self, seq: int, stamp: float, position: Vector, velocity: Vector, yaw: float, words: array[float]
-    ) -> None:
-        """A sample sets out."""
-        k, samples = self.next * self.wide, self.samples
-        samples[k], samples[k + 1] = stamp + self.delay, float(seq)
+        self, arrival: float, seq: int, stamp: float, position: Vector, velocity: Vector, yaw: float,
+        words: array[float],
+    ) -> None:  # fmt: skip
+        """A sample sets out; it may overtake others."""
+        samples, wide, place = self.samples, self.wide, self.next
+        self.next = (place + 1) % self.size
+        assert self.next != self.first, "more samples on a link than there is room for"
+        while place != self.first:
+            before = (place - 1) % self.size
+            if samples[before * wide] <= arrival:
+                break
+            for j in range(wide):
+                samples[place * wide + j] = samples[before * wide + j]
+            place = before
+        k = place * wide
+        samples[k], samples[k + 1] = arrival, float(seq)
         samples[k + 2] = stamp
         samples[k + 3], samples[k + 4], samples[k + 5] = position
         samples[k + 6], samples[k + 7], samples[k + 8] = velocity
         samples[k + 9] = yaw
         for j in range(self.wide - SENT):
             samples[k + SENT + j] = words[j]
-        self.next = (self.next + 1) % self.size
 
     def deliver(self, t: float) -> None:
         """The receiver gets the samples that have arrived by `t` [s]."""
@@ -119,9 +133,12 @@ class Planned:
 class Ledger:
     """Notes of a run."""
 
-    __slots__ = ("count", "laws", "lean", "memory", "reason", "rows", "sample", "samples", "sent", "times", "wide")
+    __slots__ = (
+        "count", "laws", "lean", "memory", "reason", "rows", "sample", "samples", "sent", "start", "times", "wide",
+    )  # fmt: skip
 
     lean: bool  # True for samples of true positions alone
+    start: float  # common start [s], NaN before it is known
     reason: int  # why a stretch ended: `AT_END`, or with the tick half done `AT_PHASES` or `AT_HAZARDS`
     count: int  # transmissions so far
     wide: int  # numbers of a transmission
@@ -133,8 +150,11 @@ class Ledger:
     memory: int  # most numbers of the memory of a law
     laws: array[float]  # memory and measures, see `Measured`, for each sample and robot
 
-    def __init__(self, members: Sequence[Member], transmissions: int, samples: int, *, lean: bool) -> None:
+    def __init__(
+        self, members: Sequence[Member], transmissions: int, samples: int, *, start: float, lean: bool
+    ) -> None:
         """Ledger of `transmissions` of each member, and `samples`."""
+        self.start = start
         self.rows = rows = len(members)
         self.lean, self.wide = lean, SENT + max(len(each.words) for each in members)
         self.count, self.sample = 0, 0
@@ -233,7 +253,15 @@ def transmit(members: list[Member], t: float, ledger: Ledger) -> None:
                 speak(speech, member.words)
             ledger.note_sent(member, t)
             for way in member.ways:
-                way.put(member.seq, t, robot.sent_position, robot.sent_velocity, robot.now.state.yaw, member.words)
+                arrival = way.channel.arrival(member.seq, t, t - ledger.start, 0)
+                if not ledger.lean:
+                    way.arrivals[way.sent] = arrival
+                way.sent += 1
+                if arrival < inf:
+                    way.put(
+                        arrival, member.seq, t, robot.sent_position, robot.sent_velocity, robot.now.state.yaw,
+                        member.words,
+                    )  # fmt: skip
 
 
 def speak(speech: Speech, words: array[float]) -> None:

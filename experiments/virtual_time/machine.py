@@ -23,7 +23,7 @@ FLAGS: Final = (
     "-O1 -std=c11 -fPIC -shared -w -ffp-contract=off -fno-builtin -fno-math-errno -fwrapv -fno-strict-aliasing"
 )
 OF_C: Final = (
-    "sin cos tan asin acos atan atan2 exp expm1 log tanh pow fmod floor ceil trunc rint sqrt fabs copysign "
+    "sin cos tan asin acos atan atan2 exp expm1 log log1p tanh pow fmod floor ceil trunc rint sqrt fabs copysign "
     "memset memcpy memmove snprintf strtod"
 )  # functions of the C library
 IN_MEMORY: Final = 1  # code of an output that libtcc knows

@@ -160,8 +160,8 @@ class VirtualNetwork:
         self.says = {} if robots[0].stepping is None else robots[0].stepping.says
         self._sent, self._received = _Samples(0 if lean else sum(self.says.values())), _Samples()
         self.instant = self._channel.instant  # poses that are transmitted are received within the tick
-        self.delays = self._channel.delays  # delays of each link [s]
-        self.is_plain = self.centre is None and self._channel.plain  # all that a link does is to take its time
+        self.channels = self._channel.links
+        self.is_quiet = self.centre is None and not self._channel.limited  # nothing asks for sizes of messages
 
     def transmit(self, row: int, robot: Robot, t: float, yaw: float, start: float) -> None:
         """A robot transmits its pose at `t` [s]. Before the common start at `start` [s] nothing is lost."""
@@ -226,16 +226,16 @@ class VirtualNetwork:
         """Hand all samples that are under way to the `ways` of their links; returns them."""
         under_way = self._channel.due(inf)
         for way in ways:
-            way.first = way.next = 0
-        for link, _, sample in under_way:
+            way.first = way.next = way.sent = 0
+        for link, arrival, sample in under_way:
             words = array("d", self._numbers(sample.words))
-            ways[link].put(sample.seq, sample.stamp, sample.position, sample.velocity, sample.yaw, words)
+            ways[link].put(arrival, sample.seq, sample.stamp, sample.position, sample.velocity, sample.yaw, words)
         return under_way
 
     def take_back(self, handed: Sequence[Arrived]) -> None:
         """Samples that were handed to the links of a stretch are under way as before: it was not flown."""
-        for link, _, sample in sorted(handed, key=lambda each: (each[2].stamp, each[2].row, each[0])):
-            self._channel.send(link, sample, sample.seq, sample.stamp)
+        for link, arrival, sample in handed:
+            self._channel.put(link, arrival, sample)
 
     def leave(
         self, ways: Sequence[Way], members: Sequence[Member], ledger: Ledger, before: Sequence[Arrived], t: float
@@ -248,23 +248,24 @@ class VirtualNetwork:
             robot, number = self.receivers[link]
             while way.first != way.next:
                 k, row = way.first, robot.neighbours.all[number].sender
-                _, seq, stamp, x, y, z, vx, vy, vz, yaw, *said = way.samples[k * way.wide : (k + 1) * way.wide]
+                arrival, seq, stamp, x, y, z, vx, vy, vz, yaw, *said = way.samples[k * way.wide : (k + 1) * way.wide]
                 pose = Sample(row, int(seq), stamp, (x, y, z), (vx, vy, vz), yaw, words=words_of(self.says, said))
-                under_way.append((stamp, row, link, pose))
+                under_way.append((stamp, row, link, arrival, pose))
                 way.first = (k + 1) % way.size
-        for stamp, _, link, sample in sorted(under_way, key=itemgetter(0, 1, 2)):  # same order as they were sent
-            self._channel.send(link, sample, sample.seq, stamp)
+        for _, _, link, arrival, sample in sorted(under_way, key=itemgetter(0, 1, 2)):  # same order as they were sent
+            self._channel.put(link, arrival, sample)
         sent = np.frombuffer(ledger.sent)[: ledger.count * ledger.wide].reshape(-1, ledger.wide)
         sent = sent[np.lexsort((sent[:, 0], sent[:, 2]))]  # robots of a kind are flown together
         sent, words = sent[:, :SENT], sent[:, SENT:]
         self._sent.extend(sent, sent[:, 2], sent[:, 0], words.tolist() if self.says and not self._lean else ())
         if not self._lean:
-            self._receive_all(sent, before, t)
+            self._receive_all(ways, sent, before, t)
 
-    def _receive_all(self, sent: Array, before: Sequence[Arrived], t: float) -> None:
+    def _receive_all(self, ways: Sequence[Way], sent: Array, before: Sequence[Arrived], t: float) -> None:
         """Note what was received until `t` [s] of what was `sent` (K, 10), and of what was under way `before`."""
         first = np.array([_row(sample) for _, _, sample in before]).reshape(-1, SENT)
         links = [np.array([link for link, _, _ in before], dtype=float)]
+        arrivals = [np.array([arrival for _, arrival, _ in before], dtype=float)]
         rows = [first]
         by_row = sent[np.argsort(sent[:, 0], kind="stable")]
         begins = np.searchsorted(by_row[:, 0], np.arange(len(self._robots) + 1)).tolist()
@@ -273,8 +274,9 @@ class VirtualNetwork:
             part = by_row[begins[sender] : begins[sender + 1]]
             rows.append(part)
             links.append(np.full(len(part), float(link)))
+            arrivals.append(np.array(ways[link].arrivals[: len(part)]))
         every, on = np.concatenate(rows), np.concatenate(links)
-        arrival = every[:, 2] + np.array(self.delays)[on.astype(np.intp)] if len(on) else np.zeros(0)
+        arrival = np.concatenate(arrivals)
         order = np.lexsort((on, every[:, 0], every[:, 2], arrival))
         order = order[arrival[order] <= t + ROUNDING_S]
         self._received.extend(every[order], arrival[order], on[order])

@@ -1,9 +1,10 @@
 """Objects of a tick as records in memory, for functions that are compiled.
 
 Numbers stand in a record as they are, tuples of numbers in place, other objects and lists as addresses, eight bytes
-each. Which attributes a record has follows from the values that an object has; texts and the like are left out. A class
-names in `FIXED` attributes that are constants, in `RARE` those that quiet functions do not use, in `NAMED` dictionaries
-of tuples of floats with the same names for ever, in `MEASURED` those of floats by the names of measures.
+each. Which attributes a record has follows from the values that an object has; texts and the like are left out.
+
+Attributes that a class names: `FIXED` are constants, `RARE` are of no use to quiet functions, `UNSIGNED` have 64 bits.
+`NAMED` are dictionaries of tuples of floats with the same names for ever. `MEASURED` are those of floats by measure.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import numpy as np
 from agents.plugins.law import Law
 
 WORD: Final = 8  # bytes
-FLOAT, INT, BOOL = "float", "int", "bool"
+FLOAT, INT, BOOL, UNSIGNED = "float", "int", "bool", "unsigned"
 NUMBERS: Final[dict[type, str]] = {float: FLOAT, int: INT, bool: BOOL}
 LONG: Final = 1000  # length from which a text or a table of a law is none that its step reads
 MEASURES: Final = 12  # most measures of the laws of a run
@@ -178,6 +179,8 @@ class Layouts:
                 kind = Named(tuple(sorted(value)), tuple(len(value[each]) for each in sorted(value)))
             elif name in measured:
                 kind = Measured()
+            elif name in getattr(owner, "UNSIGNED", ()):
+                kind = UNSIGNED
             elif name not in names and value is not None:
                 kind = NUMBERS.get(type(value)) or self.kind(value, (owner, name))
             if kind is not None:
@@ -306,7 +309,7 @@ class _FullError(Exception):
 
 def _code(kind: Any) -> str:
     """Code of `struct` of the words of a kind."""
-    return "d" if kind == FLOAT or isinstance(kind, Floats | Named | Measured) else "q"
+    return "d" if kind == FLOAT or isinstance(kind, Floats | Named | Measured) else "Q" if kind == UNSIGNED else "q"
 
 
 def _format(kind: Any) -> str:

@@ -153,8 +153,8 @@ class VirtualRun:
         self.twin = TwinBody(request, shared_world(plan, names))
         self._body = shadowed(self.twin, request, shadow_periods(plan, names))
         self.network = VirtualNetwork(plan, self.robots, seed, lean=lean)
-        # each robot moves by itself, and the network does nothing but take its time
-        self.lonely = self._body is self.twin and self.twin.lonely and self.network.is_plain
+        # each robot moves by itself, and the network needs no messages
+        self.lonely = self._body is self.twin and self.twin.lonely and self.network.is_quiet
         self._laws = [robot.stepping for robot in self.robots]  # those of guided robots are the centre's
         if (centre := self.network.centre) is not None:
             guides = centre.centre.robots
@@ -225,6 +225,11 @@ class VirtualRun:
     def snapshot(self, t: float) -> Snapshot:
         """State of the run at `t` [s]."""
         return Snapshot(t - self._conductor.start_at, t, self.robots, self._states, self.twin.engine)
+
+    @property
+    def start_at(self) -> float:
+        """Common start [s], NaN before it is known."""
+        return self._conductor.start_at
 
     def _end_tick(self, t: float) -> None:
         self._conductor.give_orders(t, self.dt)

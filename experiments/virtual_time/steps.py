@@ -29,12 +29,14 @@ class Steps:
         self._laws = [(each.row, law) for each in members if (law := each.robot.stepping) is not None]
         self.measures = list[str]()  # names of measures
         self.error: BaseException | None = None  # error of a law, or interruption
+        self._begun: Any = None  # words of the records at the beginning
         self.call = CALL(self._call)
         self.address = ctypes.cast(self.call, ctypes.c_void_p).value or 0
 
     def board(self, image: Image) -> None:
         """Find the records of a stretch; what is called back can be undone."""
-        self._image, self._begun, self.error = image, None, None
+        self._image, self.error = image, None
+        self._begun = None
         rare = [each.robot.goals for each in self._members if each.robot.stepping or each.robot.goals.changes_shape]
         self._rare = {image.address(each): each for each in rare}
         if rare:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import sys
+from array import array
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -34,6 +35,7 @@ LEAST: Final = 20  # ticks below which a stretch is followed by a pause
 PAUSE: Final = 10  # ticks that are flown in plain Python, twice as many after the next short stretch
 LONGEST_PAUSE: Final = 160  # ticks of the longest pause
 ROOM: Final = 2  # more samples on a link than its delay asks for
+LATE, LATEST_S = 40.0, 60.0  # room for jitter: times its mean, of which one in 10¹⁷ is more, and [s]
 STEPS: Final = ("advance", "deliver", "observe", "transmit", "detect", "pursue", "note")
 DRIVER: Final = """
 def stretch(crew, k, end, dt, log_every, instant):
@@ -82,7 +84,12 @@ class Flown(Protocol):
     dt: float  # length of a tick [s]
     log_every: int  # ticks from one sample to the next
     lean: bool  # True for samples of true positions alone
-    lonely: bool  # each robot moves by itself, and the network does nothing but take its time
+    lonely: bool  # each robot moves by itself, and the network needs no messages
+
+    @property
+    def start_at(self) -> float:
+        """Common start [s], NaN before it is known."""
+        ...
 
     def note(self, ledger: Ledger, steps: Steps) -> None:
         """Note the samples of a stretch."""
@@ -153,9 +160,10 @@ class Stretches:
             for row, (robot, twin) in enumerate(zip(flight.robots, twins, strict=True))
         ]
         self._steps, self._ways = Steps(self._members), list[Way]()
-        for (robot, k), delay in zip(network.receivers, network.delays, strict=True):
+        for (robot, k), channel in zip(network.receivers, network.channels, strict=True):
             sender = robot.neighbours.all[k]
-            way = Way(sender, delay, ROOM + round(delay * rates.pose_hz), sum(says.values()))
+            late = min(LATE * channel.jitter, LATEST_S)
+            way = Way(sender, channel, ROOM + round((channel.delay + late) * rates.pose_hz), sum(says.values()))
             self._members[sender.sender].ways.append(way)
             self._ways.append(way)
         self._plans: dict[int, Planned] = {}
@@ -179,7 +187,11 @@ class Stretches:
         ticks = end - k
         rates = flight.plan.experiment.rates
         questions = ticks // round(rates.body_hz / rates.pose_hz) + ROOM
-        ledger = Ledger(self._members, questions, ticks // flight.log_every + ROOM, lean=flight.lean)
+        samples = ticks // flight.log_every + ROOM
+        ledger = Ledger(self._members, questions, samples, start=flight.start_at, lean=flight.lean)
+        if not flight.lean:
+            for way in self._ways:
+                way.arrivals = array("d", (0.0,)) * questions
         for member in self._members:
             member.seq = flight.network.seq[member.row]
             member.twin.reserve(ticks)

@@ -4,9 +4,10 @@
    2^61 set it too, since Python's have no end. `turns` counts those of all loops: one that never ends is left. */
 
 typedef long long whole, name; /* names of robots are their numbers */
+typedef unsigned long long word; /* arithmetic modulo 2^64 */
 
 double sin(double), cos(double), tan(double), asin(double), acos(double), atan(double), atan2(double, double);
-double exp(double), expm1(double), log(double), tanh(double), pow(double, double), fmod(double, double);
+double exp(double), expm1(double), log(double), log1p(double), tanh(double), pow(double, double), fmod(double, double);
 double floor(double), ceil(double), trunc(double), rint(double), sqrt(double), fabs(double), copysign(double, double);
 int snprintf(char *, unsigned long, const char *, ...);
 double strtod(const char *, char **);
@@ -44,6 +45,7 @@ static inline whole py_abs_i(whole i) { return i < 0 ? -i : i; }
 static inline whole py_min_i(whole i, whole j) { return j < i ? j : i; }
 static inline whole py_max_i(whole i, whole j) { return j > i ? j : i; }
 static inline double py_exact(whole i) { if (i > exact || i < -exact) fault = 1; return (double)i; }
+static inline double py_of_word(word x) { return x >> 63 ? 2.0 * (whole)(x >> 1 | (x & 1)) : (double)(whole)x; }
 static inline whole py_int(double x) { if (fabs(x) < largest) return (whole)x; fault = 1; return 0; }
 
 /* floats */
@@ -119,7 +121,7 @@ static inline void *py_room(whole bytes) {
 #define OF_MATH(name, error) static inline double py_##name(double x) { if (error) fault = 1; return name(x); }
 #define GROWS(name) static inline double py_##name(double x) { \
   double found = name(x); if (found == inf && x < inf) fault = 1; return found; }
-OF_MATH(sqrt, x < 0.0) OF_MATH(log, x <= 0.0) OF_MATH(sin, fabs(x) == inf) OF_MATH(cos, fabs(x) == inf)
+OF_MATH(sqrt, x < 0.0) OF_MATH(log, x <= 0.0) OF_MATH(log1p, x <= -1.0) OF_MATH(sin, fabs(x) == inf) OF_MATH(cos, fabs(x) == inf)
 OF_MATH(tan, fabs(x) == inf) OF_MATH(asin, fabs(x) > 1.0) OF_MATH(acos, fabs(x) > 1.0) GROWS(exp) GROWS(expm1)
 OF_MATH(atan, 0) OF_MATH(tanh, 0) OF_MATH(fabs, 0)
 static inline double py_atan2(double y, double x) { return atan2(y, x); }

@@ -39,14 +39,14 @@ from experiments.virtual_time.translator.kinds import (
     type_of,
 )
 
-OF_FLOATS: Final = "sqrt sin cos tan asin acos atan atan2 log exp expm1 tanh fabs copysign degrees radians"
+OF_FLOATS: Final = "sqrt sin cos tan asin acos atan atan2 log log1p exp expm1 tanh fabs copysign degrees radians"
 MATH: Final = {  # functions of `math`, with the types of their values
     **dict.fromkeys(OF_FLOATS.split(), DOUBLE), **dict.fromkeys(("floor", "ceil", "trunc"), WHOLE),
     **dict.fromkeys(("isfinite", "isinf", "isnan"), BOOLEAN),
 }  # fmt: skip
 BUILTINS: Final = {"abs", "bool", "float", "int", "len", "max", "min", "round"}
 NEW_SUMS: Final = (3, 12)  # Python that adds floats in another way
-NUMBER_OF: Final[dict[type, str]] = {RobotFacts: "number", Neighbour: "sender"}  # of a name
+NUMBER_OF: Final[dict[type, str]] = {RobotFacts: "number", Neighbour: "sender"}  # attribute with the number of a name
 
 
 class Calls(Expressions):

@@ -12,12 +12,14 @@ from typing import Any, Final, Protocol
 from agents.plugins.law import Control
 from experiments.virtual_time.records import FLOAT, INT, Items, RecordLayout
 from experiments.virtual_time.translator.kinds import (
+    ALL_BITS,
     BOOLEAN,
     DOUBLE,
     LEAVE,
     NAME,
     NONE,
     WHOLE,
+    WORD,
     Made,
     OutsideError,
     Several,
@@ -158,6 +160,8 @@ class Expressions(ast.NodeVisitor):
         """The value as a number of this type, as Python's arithmetic takes it."""
         if value.type == kind:
             return value
+        if value.type == WORD and kind == DOUBLE:
+            return Value(DOUBLE, f"py_of_word({value.text})")
         if value.type not in (WHOLE, BOOLEAN) or kind == BOOLEAN:
             raise self.error(node, f"{listed(value.type)} where a number belongs")
         if value.constant is not ...:
@@ -290,7 +294,14 @@ class Expressions(ast.NodeVisitor):
         return Value(WHOLE, f"(~{self.of_type(found, WHOLE, node).text})")
 
     def visit_BinOp(self, node: ast.BinOp) -> Value:  # noqa: PLR0911 - one for each sort
-        (a, b), op = self.several([node.left, node.right]), type(node.op)
+        op = type(node.op)
+        if op is ast.BitAnd and not calls(node) and self.aside(partial(self.visit, node.right))[0].constant == ALL_BITS:
+            return Value(WORD, self.modulo(node.left))
+        a, b = self.several([node.left, node.right])
+        if a.type == WORD and (b.type == WORD and op in BITS):
+            return Value(WORD, f"({a.text} {BITS[op]} {b.text})")
+        if a.type == WORD and op is ast.RShift and b.constant in range(64):
+            return Value(WORD, f"({a.text} >> {b.constant})")
         kind = WHOLE if {a.type, b.type} <= {WHOLE, BOOLEAN} else DOUBLE
         if op in BITS and kind == WHOLE:
             both = BOOLEAN if a.type == b.type == BOOLEAN else WHOLE
@@ -312,6 +323,15 @@ class Expressions(ast.NodeVisitor):
         if op is ast.Div and b.constant not in (..., 0.0):
             return Value(DOUBLE, f"({a.text} / {b.text})")
         return Value(kind, f"{DIVISIONS[op, kind]}({a.text}, {b.text})")
+
+    def modulo(self, node: ast.expr) -> str:
+        """Sums, products and bits modulo 2⁶⁴."""
+        if isinstance(node, ast.BinOp) and type(node.op) in SUMS | BITS:
+            return f"({self.modulo(node.left)} {(SUMS | BITS)[type(node.op)]} {self.modulo(node.right)})"
+        found = self.visit(node)
+        if found.type not in (WHOLE, WORD):
+            raise self.error(node, f"{listed(found.type)} where a whole number belongs")
+        return f"(word)({found.text})"
 
     def visit_BoolOp(self, node: ast.BoolOp) -> Value:
         return self.joined(node, self.visit)

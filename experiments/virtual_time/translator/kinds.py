@@ -10,25 +10,27 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final, NamedTuple
 
-from experiments.virtual_time.records import BOOL, FLOAT, INT, Floats, Items, Measured, Named, RecordLayout
+from experiments.virtual_time.records import BOOL, FLOAT, INT, UNSIGNED, Floats, Items, Measured, Named, RecordLayout
 
 LEAVE: Final = "@leave"  # stands for the return of a function at an error
 # types: numbers, by C's names, and what has no value; that of an object is its layout, that of a list its `Items`
-DOUBLE, WHOLE, BOOLEAN, VOID, NONE, NAME = "double", "whole", "_Bool", "void", "none", "name"
-STORED: Final = {FLOAT: DOUBLE, INT: WHOLE, BOOL: WHOLE}  # types in a record
+DOUBLE, WHOLE, WORD, BOOLEAN, VOID, NONE, NAME = "double", "whole", "word", "_Bool", "void", "none", "name"
+STORED: Final = {FLOAT: DOUBLE, INT: WHOLE, BOOL: WHOLE, UNSIGNED: WORD}  # types in a record
 WORDS: Final = {
     DOUBLE: "a float",
     WHOLE: "a whole number",
+    WORD: "a whole number of 64 bits",
     BOOLEAN: "a bool",
     VOID: "nothing",
     NONE: "None",
     NAME: "a name",
 }
 LARGEST: Final = 1 << 61  # whole number of which C knows sums
+ALL_BITS: Final = (1 << 64) - 1
 C_WORDS: Final = re.compile(
     "auto|break|case|char|const|continue|default|do|double|else|enum|extern|float|for|goto|if|inline|int|long|register|"
     "restrict|return|short|signed|sizeof|static|struct|switch|typedef|union|unsigned|void|volatile|while|"
-    "whole|fault|turns|back|unknown|inf|exact|largest|nothing|fly|stretch|_.*|.*_|py_.*"
+    "whole|word|fault|turns|back|unknown|inf|exact|largest|nothing|fly|stretch|_.*|.*_|py_.*"
 )
 
 
@@ -106,6 +108,8 @@ def constant(x: Any) -> Value:
         return Value(NONE, "0", None)
     if isinstance(x, int) and abs(x) < LARGEST:  # also a member of an enumeration
         return Value(BOOLEAN, str(int(x)), x) if isinstance(x, bool) else Value(WHOLE, f"({int(x)}LL)", int(x))
+    if isinstance(x, int) and LARGEST <= x <= ALL_BITS:
+        return Value(WORD, f"({x}ULL)", x)
     if type(x) is float:
         text = x.hex() if math.isfinite(x) else "unknown.number" if math.isnan(x) else "inf" if x > 0.0 else "-inf"
         return Value(DOUBLE, f"({text})", x)

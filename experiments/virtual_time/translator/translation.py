@@ -390,12 +390,11 @@ class Walk(Calls):
         names = self.iteration(generator.iter, node)
         if isinstance(names, Iteration) or ast.unparse(node.key) != generator.target.id:
             raise self.error(node, "a dictionary by something else than names")
-        before, values = dict(self._locals), dict[str, Value]()
+        before, values = (dict(self._locals), set(self._set)), dict[str, Value]()
         for name in names:
             self.bind(generator.target, name)
             values[name.constant] = self.saved(self.visit(node.value))
-        self._locals = before
-        self._set.discard(generator.target.id)
+        self._locals, self._set = before
         return self.with_names(dict, {name: values[name] for name in sorted(values)})
 
     def builtin(self, found: Any, node: ast.Call) -> Value:

@@ -239,10 +239,10 @@ def of_math(x, y):
 
 
 def of_math_with_limits(x):
-    """`sin cos tan asin acos exp expm1 log` of `math`"""
+    """`sin cos tan asin acos exp expm1 log log1p` of `math`"""
     if not -1.0 <= x <= 1.0:
-        return math.sin(x), math.cos(x), math.tan(x), math.exp(x), math.expm1(x), math.log(x)
-    return math.asin(x), math.acos(x), sqrt(x), 0.0, 0.0, 0.0
+        return math.sin(x), math.cos(x), math.tan(x), math.exp(x), math.expm1(x), math.log(x), math.log1p(x)
+    return math.asin(x), math.acos(x), sqrt(x), 0.0, 0.0, 0.0, math.log1p(x)
 
 
 def whole_parts(x, y, i):
@@ -254,6 +254,16 @@ def of_python(x, y, i, j):
     """`min` and `max` of numbers of one type, `abs`, `len`, `float`, `bool`"""
     least = min(x, y), max(x, y), min(i, j), max(i, j), min((x, y, 0.0)), max(x, 0.0), min(max(x, -1.0), 1.0)
     return least, abs(x), abs(i), len((x, y)), float(i), float(x < y), bool(i), min(nan, x), max(x, nan)
+
+
+def words(x, i, j):
+    """sums, products and bits of whole numbers modulo 2⁶⁴: `& 0xFFFFFFFFFFFFFFFF`; bits of those, and `>>`"""
+    word = (i * ODD + j) & ALL
+    other = ((word ^ (word >> 30)) * ODD + 7) & ALL
+    return x * word, (other >> 11) * 0.5, ((other ^ word) | other) * 1.0, (word & other) * 2.0, (i & ALL) * 1.0
+
+
+ODD, ALL = 0xBF58476D1CE4E5B9, 0xFFFFFFFFFFFFFFFF
 
 
 def slices(x, y):

@@ -28,6 +28,8 @@ from experiments.definition.experiment import (
     ChannelTable,
     Formation,
     LegTable,
+    LinkChannelTable,
+    Outage,
     RobotTable,
     WorldTable,
 )
@@ -370,7 +372,39 @@ def test_law_outside_of_the_subset_is_flown_plain():
     assert f"{Path(__file__).name}:" in reason
 
 
-@pytest.mark.parametrize("parts", [{"channel": ChannelTable(loss=0.1)}, {"world": WorldTable(engine="pymunk")}])
+CHANNELS = {
+    "loss": ChannelTable(loss=0.3),
+    "bursts": ChannelTable(loss=0.2, burst=4.0, delay_s=0.0),  # received within the tick
+    "jitter": ChannelTable(jitter_s=0.2, delay_s=0.02),  # samples overtake others
+    "outage": ChannelTable(outages=[Outage(from_s=0.5, until_s=1.5)]),
+    "by link": ChannelTable(links={"A > B": LinkChannelTable(loss=0.5, jitter_s=0.1)}),
+    "all": ChannelTable(loss=0.1, burst=3.0, jitter_s=0.3, delay_s=0.05, outages=[Outage(from_s=1.0, until_s=1.2)]),
+}
+
+
+@pytest.mark.parametrize("law", ["distance", "leader-observer", "coverage"])
+@pytest.mark.parametrize("trigger", ["periodic", "send-on-delta"])
+@pytest.mark.parametrize("channel", CHANNELS.values(), ids=CHANNELS)
+def test_effects_of_the_network_are_compiled(channel, trigger, law):
+    """Losses and arrivals follow from the seed: the same samples are lost, and the rest arrives at the same times."""
+    experiment, change = remembering(plugin(LAWS, law))
+    experiment = changed(experiment, channel=channel)
+
+    def with_trigger(given):
+        return replace(change(given), trigger=plugin(TRIGGERS, trigger))
+
+    for seed, lean in ((1, False), (2, True)):
+        log, ticks = same(experiment, change=with_trigger, seed=seed, lean=lean)
+        assert ticks > 300
+        assert (sum(log.lost) > 0) == (channel is not CHANNELS["jitter"])
+
+
+@pytest.mark.parametrize("channel", [ChannelTable(), CHANNELS["all"]])
+def test_robots_without_links_are_compiled(channel):
+    assert same(follower(formation=Formation(links={}), channel=channel))[1] > 300
+
+
+@pytest.mark.parametrize("parts", [{"channel": ChannelTable(bandwidth=1e5)}, {"world": WorldTable(engine="pymunk")}])
 def test_what_is_not_compiled(parts):
     assert same(follower(duration_s=1.0, **parts))[1] == 0
 
