@@ -227,6 +227,8 @@ def turned(self, neighbours, position, velocity, yaw, target, speed, leads):  # 
 )
 def test_compiled_steps_are_those_of_the_process(monkeypatch, owner, name, other):
     """One source: what is changed there changes compiled ticks and plain ones alike."""
+    monkeypatch.setattr(stretch, "DRIVERS", {})
+    monkeypatch.setattr(stretch, "RECENT", {})
     made = remembering(plugin(LAWS, "leader-observer"))
     before, ticks = same(made[0], change=made[1])
     monkeypatch.setattr(owner, name, other)
