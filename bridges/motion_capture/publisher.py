@@ -277,7 +277,7 @@ def describe_error(error: OSError | MalformedStream) -> str:
 class PositioningLaunch(NetworkLaunch, frozen=True, kw_only=True, rename="kebab"):
     """Positions from motion capture for robots."""
 
-    system: Annotated[str, Meta(title="SYSTEM", description="vicon, optitrack, qualisys, cameras, one of a plug-in")]
+    system: Annotated[str, Meta(title="SYSTEM", description="vicon, optitrack, qualisys, vrpn, cameras, a plug-in's")]
     server: Annotated[
         str, Meta(title="HOST[:PORT]", description="where the program of the system runs; of cameras, their file")
     ]

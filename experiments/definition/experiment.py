@@ -356,7 +356,7 @@ class Positioning(Coordinates, frozen=True):
 
     source: Annotated[
         str,
-        doc("vicon, optitrack or qualisys, as SYSTEM://HOST[:PORT], or cameras://FILE; simulated: SYSTEM-twin"),
+        doc("vicon, optitrack, qualisys or vrpn, as SYSTEM://HOST[:PORT], or cameras://FILE; simulated: SYSTEM-twin"),
     ]
     names: Annotated[
         dict[Name, Annotated[str, Meta(min_length=1)]],

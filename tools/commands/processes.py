@@ -229,7 +229,7 @@ def bridge(
         str,
         Argument(
             metavar="SYSTEM",
-            help="vicon, optitrack, qualisys, cameras, that of a plug-in, or ros2; with --help it says more.",
+            help="vicon, optitrack, qualisys, vrpn, cameras, that of a plug-in, or ros2; with --help it says more.",
         ),
     ],
 ) -> int:

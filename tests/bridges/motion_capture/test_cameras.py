@@ -14,12 +14,13 @@ from agents.body.capture_reader import CaptureFrame
 from agents.clock import uptime
 from agents.ticks import Ticks
 from bridges.motion_capture.cameras import file
-from bridges.motion_capture.cameras.calibrate import BOARD, CalibrationError, LensViews, hang
+from bridges.motion_capture.cameras.calibrate import BOARD, CalibrationError, calibrate, hang, print_sheets
+from bridges.motion_capture.cameras.images import Images
 from bridges.motion_capture.cameras.reader import CamerasReader
 from bridges.motion_capture.cameras.tracker import Tracker
 from bridges.motion_capture.cameras.vision import FLAT, CameraModel, TagDetector, in_space, on_floor, square
 from bridges.motion_capture.publisher import PoseFilter
-from bridges.motion_capture.twin.cameras import CameraImages, CamerasTwin, ImageClient, Sheet, jpeg
+from bridges.motion_capture.twin.cameras import CamerasTwin, ImageClient, Sheet, jpeg
 from bridges.motion_capture.twin.capture import upright
 from tests.bridges.motion_capture.cameras_lab import CORNERS, FLOOR, Room, hung, moved, text
 from tests.bridges.motion_capture.test_systems import ALL, BEGIN, FAULTS, LASTS, fault
@@ -52,9 +53,9 @@ def poses_at(k, names, rng):
     return poses
 
 
-def flown(seen, images=14, cameras="ABCD"):
+def flown(seen, images=14, cameras="ABCD", room=None):
     """Distances [mm] and yaw errors [°] of all poses by name, of cameras that expose together."""
-    room, rng = Room(seen), np.random.default_rng(2)
+    room, rng = room or Room(seen), np.random.default_rng(2)
     tracker, found = Tracker(seen, print), {name: [] for name in seen.bodies}
     for k in range(images):
         true = poses_at(k, seen.bodies, rng)
@@ -199,29 +200,6 @@ def test_a_floor_tag_elsewhere_is_named():
         hang("A", {n: corners[n] for n in (21, 22)}, seen.floor, seen.measured["A"])
 
 
-def test_the_lens_comes_from_a_board():
-    true = hung((0.0, 0.0, 0.0), at=(1.0, 0.0, 0.0))
-    images = CameraImages(CameraModel(true), [], np.random.default_rng(1))
-    picture, views, rng = BOARD.generateImage((800, 600)), LensViews(), np.random.default_rng(3)
-    outline = np.array([[-4.0, 3.0, 0.0], [4.0, 3.0, 0.0], [4.0, -3.0, 0.0], [-4.0, -3.0, 0.0]]) * 0.045
-    facing = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # from the board to the room
-    assert not views.add(images.image([]))
-    for k in range(120):
-        across, up = ((k % 3) - 1, (k // 3 % 3) - 1)
-        far = 0.55 + 0.25 * rng.random()
-        turn = facing @ cv2.Rodrigues(rng.uniform(-0.5, 0.5, 3))[0]
-        centre = np.array([far, -0.52 * far * across, 0.27 * far * up])
-        views.add(images.image([Sheet(picture, centre + outline @ turn.T)]))
-        if views.enough:
-            break
-    assert views.enough, (views.count, views.unseen)
-    matrix, lens, error = views.lens()
-    assert error < 0.5
-    assert [matrix[0, 0], matrix[1, 1]] == pytest.approx([720.0, 720.0], rel=0.01)
-    assert [matrix[0, 2], matrix[1, 2]] == pytest.approx([640.0, 360.0], abs=6.0)
-    assert lens[0] == pytest.approx(-0.08, abs=0.02)
-
-
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
@@ -321,6 +299,88 @@ def test_each_fault_of_cameras(tmp_path, name):
         assert line.count(robot, end + 0.6) >= 3, line.said
         during = line.count(robot, BEGIN + 0.1, BEGIN + 0.45)
         assert during == 0 if robot in hidden else during >= 1, (robot, line.said)
+
+
+@pytest.mark.parametrize(("name", "size"), [("late", 0.2), ("turned", 0.5), ("stuck", 0.002)])
+def test_faults_that_no_image_shows_pass(tmp_path, name, size):
+    line = Line(tmp_path, **fault(name), capture_by=size)
+    line.run(BEGIN + LASTS)
+    line.twin.clients.clear()
+    line.twin.close()
+    during = [each for each in line.published if each[0] == "CF01" and 0.05 <= each[1] - BEGIN < LASTS - 0.05]
+    assert len(during) >= 3
+    for _, stamp, (x, y, z), yaw in during:
+        t = {"late": stamp - size, "turned": stamp, "stuck": BEGIN}[name]
+        assert (x, y, z) == pytest.approx((0.3 * cos(t), 0.3 * sin(t), 0.5), abs=0.01)
+        if name != "stuck":
+            assert cos(yaw - t - (size if name == "turned" else 0.0)) > 0.99
+
+
+class Shown:
+    """Images of a lab that is calibrated: the board wherever it is asked for, then the floor."""
+
+    troubles = ""
+
+    def __init__(self, lab, boards):
+        self.room, self.boards = Room(lab), boards
+
+    def newest(self, _timeout):
+        sheet = next(self.boards, None)
+        return [(name, 0.0, images.image([sheet[name]] if sheet else [])) for name, images in self.room.images.items()]
+
+
+def board(camera, k, rng):
+    """The board before a camera, each time elsewhere in its image."""
+    outline = np.array([[-4.0, 3.0, 0.0], [4.0, 3.0, 0.0], [4.0, -3.0, 0.0], [-4.0, -3.0, 0.0]]) * 0.045
+    far = 0.55 + 0.25 * rng.random()
+    centre = np.array([0.52 * far * ((k % 3) - 1), 0.27 * far * ((k // 3 % 3) - 1), far])  # as the camera sees it
+    turn = cv2.Rodrigues(rng.uniform(-0.5, 0.5, 3))[0] @ np.diag([1.0, -1.0, -1.0])
+    return Sheet(BOARD.generateImage((800, 600)), (centre + outline @ turn.T) @ camera.rotation + camera.place)
+
+
+def test_a_lab_is_calibrated_by_board_and_floor(tmp_path):
+    true, rng, said = lab(cameras="A"), np.random.default_rng(3), []
+    models = {name: CameraModel(each) for name, each in true.measured.items()}
+    boards = iter([{name: board(each, k, rng) for name, each in models.items()} for k in range(60)])
+    bare = file.parse(text(WHEELS, "A").partition(file.MARK)[0])
+    measured = calibrate(bare, Shown(true, boards), said.append, again=False, limit_s=600.0)
+    for name, each in measured.items():
+        assert np.linalg.norm(np.subtract(each.place, true.measured[name].place)) < 0.03
+        assert each.matrix == pytest.approx(true.measured[name].matrix, rel=0.02)
+    assert said[0].startswith("move the board about before A: near")
+    seen = file.parse(file.with_measured(text(WHEELS, "A"), measured))
+    errors = [away for away, _ in flown(seen, 6, "A", Room(lab(WHEELS, cameras="A")))["KH01"]]
+    assert max(errors) < 10.0
+    with pytest.raises(CalibrationError, match=r"not seen often enough \(A: 0 of 15 views\)"):
+        calibrate(bare, Shown(true, iter([])), said.append, again=False, limit_s=0.0)
+
+
+def test_tags_are_printed_in_their_size(tmp_path):
+    (tmp_path / "cameras.toml").write_text(text(WHEELS))
+    print_sheets(tmp_path / "cameras.toml", tmp_path / "tags.html")
+    page = (tmp_path / "tags.html").read_text()
+    assert page.count("<figure>") == len(FLOOR) + len(WHEELS) + 1
+    assert page.count("width:200mm") == len(FLOOR)
+
+
+def test_a_video_file_is_a_camera(tmp_path):
+    """As OpenCV gives the images of a webcam."""
+    seen = lab(cameras="A")
+    writer = cv2.VideoWriter(str(tmp_path / "a.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (1280, 720))
+    image = Room(seen).image("A", {})
+    for _ in range(20):
+        writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+    writer.release()
+    table = file.CameraTable(str(tmp_path / "a.avi"))
+    images = Images(msgspec.structs.replace(seen, cameras={"A": table, "B": file.CameraTable(str(tmp_path / "b.avi"))}))
+    came = []
+    until(lambda: came.extend(images.newest(0.2)) or came)
+    until(lambda: "B: " in images.troubles and "cannot be opened" in images.troubles)
+    images.close()
+    name, exposed, grey = came[0]
+    assert (name, grey.shape) == ("A", (720, 1280))
+    assert abs(exposed - uptime()) < PATIENCE_S
+    assert np.abs(grey.astype(float) - image).mean() < 4.0
 
 
 def test_images_come_over_http(tmp_path):

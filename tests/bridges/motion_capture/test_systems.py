@@ -181,6 +181,26 @@ def test_each_fault_of_each_system(monkeypatch, system, name):
     assert bench.connections == 1
 
 
+@pytest.mark.parametrize(("name", "size"), [("late", 0.1), ("turned", 0.5), ("stuck", 0.002)])
+def test_faults_that_no_frame_shows_pass(monkeypatch, system, name, size):
+    """Robots, preflight and hop notice these: the bridge gives what the system says, with its stamps."""
+    bench = Bench(monkeypatch, system, **fault(name), capture_by=size)
+    bench.run(BEGIN + LASTS + 0.1)
+    during = {robot: [] for robot in ALL}
+    for robot, stamp, position, yaw in bench.published:
+        if BEGIN + 0.01 <= stamp < BEGIN + LASTS:
+            during[robot].append((stamp, position, yaw))
+    for robot in ALL:
+        wrong = robot == "CF01" or name == "late"
+        assert len(during[robot]) > 50
+        for stamp, position, yaw in during[robot]:
+            stuck = BEGIN if wrong else stamp
+            true, heading = true_pose(robot, {"late": stamp - size, "turned": stamp, "stuck": stuck}[name])
+            assert dist(position, true) < (6.0 * size if wrong and name == "stuck" else 1e-4)
+            if name != "stuck":
+                assert cos(yaw - heading - (size if wrong and name == "turned" else 0.0)) > 1.0 - 1e-8
+
+
 def test_swapped_bodies_are_not_believed_at_once(monkeypatch, system):
     bench = Bench(monkeypatch, system, **fault("swapped"))
     bench.run(BEGIN + 0.2)
