@@ -29,9 +29,8 @@ class CamerasFileError(ExplainedError, ValueError):
 class CameraTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Camera of the lab."""
 
-    source: Annotated[
-        str, Meta(min_length=1)
-    ]  # http://HOST[:PORT]/PATH with a stream of JPEG, /dev/video0, a video file
+    # http://HOST[:PORT]/PATH with a stream of JPEG, /dev/video0, a video file
+    source: Annotated[str, Meta(pattern=r"^(http://\S+|[^:]+)$")]
     latency_s: NotNegative = 0.0  # age of its images on arrival, where they bring no time of exposure [s]
 
 

@@ -109,8 +109,9 @@ class Tracker:
         lost = [body for body in self._bodies if t - self._last.get(body, (-inf,))[0] > LOST_S]
         period = 0.0 if len(lost) == len(self._bodies) else SEARCH_S if lost else WHOLE_S
         found: dict[int, Array] = {}
-        # one camera after the other: a frame waits for the slowest
-        turn = min(self.cameras.values(), key=lambda each: each.whole_at) is tracked
+        # one camera after the other, as a frame waits for the slowest; silent ones have no turn
+        live = [each for each in self.cameras.values() if each is tracked or each.newest > t - LIVE_S]
+        turn = min(live, key=lambda each: each.whole_at) is tracked
         if tracked.places is None or (t - tracked.whole_at >= period and (turn or not period)):
             tracked.whole_at = t
             found, tracked.twice = tracked.detector.whole(grey)

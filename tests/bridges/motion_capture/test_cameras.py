@@ -145,6 +145,18 @@ def test_a_tag_that_is_there_twice_is_dropped():
     assert frame[1]["KH02"] is not None
 
 
+def test_a_silent_camera_stops_no_search():
+    seen = lab(WHEELS, cameras="ABC")
+    room, tracker = Room(seen), Tracker(seen, print)
+    true = {"KH01": ((-0.4, -0.5, 0.0), upright(0.0)), "KH02": ((-0.8, -0.2, 0.0), upright(0.0))}
+    for k in range(12):
+        shown = dict([*true.items()][: 1 + (k > 5)])  # one robot, then two; B never has an image
+        frames = [tracker.see(camera, 0.1 * k, room.image(camera, shown)) for camera in ("AC" if k == 0 else "A")]
+    t, poses = frames[-1]
+    assert t == pytest.approx(1.1)
+    assert [poses[name] is None for name in WHEELS] == [False, False, True]
+
+
 def test_images_of_another_size_are_unused():
     seen, said = lab(cameras="A"), []
     tracker = Tracker(seen, said.append)
@@ -205,6 +217,7 @@ def test_a_floor_tag_elsewhere_is_named():
     [
         ("[bodies", "cameras.toml: Expected .* at the end of"),
         ("rate_hz = -1", r"rate_hz"),
+        ('[cameras.X]\nsource = "rtsp://camera"', r"regex.*cameras"),
         ("[bodies.X]\ntag = 20\nsize = 0.1\nheight = 0", "tag 20 stands twice"),
         ("[bodies.X]\ntag = 587\nsize = 0.1\nheight = 0", r"586.*bodies"),
         (file.with_measured("", {"Z": hung((0.0, 0.0, 1.0), at=(1.0, 0.0, 0.0))}), "measured.Z. is of no camera"),
