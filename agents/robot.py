@@ -64,7 +64,7 @@ class Robot:
         if assignment.guided:
             self.guidance = ReceivedGoals(flies=kind.flies, silence_s=limits.neighbour_timeout_s)
         self.keeping = StationKeeping(assignment.ground)
-        self.lifecycle = Lifecycle(kind, assignment.hover, assignment.duration)
+        self.lifecycle = Lifecycle(kind, assignment.hover, assignment.duration, assignment.lands_at)
         stepping = self._stepping = self.goals.stepping
         self._follower = None if stepping is None else VelocityFollower(kind, assignment.ground)
         speech = None if stepping is None or assignment.guided else stepping.speech

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import nan
+from math import inf, nan
 
 from agents.body.kinds import Kind
 from agents.body.limits import Limits
@@ -34,6 +34,7 @@ class Assignment:
     pose_every: int  # ticks from one question to the trigger to the next
     decide_every: int  # ticks from one goal to the next
     duration: float  # duration of the experiment [s]
+    lands_at: float = inf  # time of an earlier landing [s]
     number: int = 0  # index among all robots of the experiment
     count: int = 1  # number of all robots
     legs: tuple[Leg, ...] = ()  # its plan

@@ -35,6 +35,7 @@ IDLE, READY, AIRBORNE, RUNNING, LANDING, DONE = (int(phase) for phase in Phase)
 AT_HEIGHT: Final = 0.05  # [m] distance below the hover height at which it has arrived
 ABOVE_HEIGHT: Final = 0.1  # [m] excess of height that counts as arrived: a Crazyflie overshoots
 FINISHED: Final = "finished"  # reasons for a landing that is no fault; orders are others
+SCRIPTED: Final = "lands as its file says"
 TOLD_TO_END: Final = "asked to end"
 PAUSED: Final = "ordered to hold"
 SETTLED: Final = 0.1  # [m/s] slower: climbing or rolling has ended
@@ -43,10 +44,10 @@ SETTLED: Final = 0.1  # [m/s] slower: climbing or rolling has ended
 class Lifecycle:
     """Phases of one robot."""
 
-    def __init__(self, kind: Kind, hover: float, duration: float) -> None:
-        """Of a robot that hovers at `hover` [m], in an experiment of `duration` [s]."""
+    def __init__(self, kind: Kind, hover: float, duration: float, lands_at: float = inf) -> None:
+        """Of a robot that hovers at `hover` [m], in an experiment of `duration`, and lands at `lands_at` [s] in it."""
         self._flies, self._hover = kind.flies, hover
-        self._duration = duration
+        self._ends_after, self._scripted = min(duration, lands_at), lands_at < duration
         self.phase = self._before = IDLE  # members of `Phase`
         self.climbing = False  # True on its way up
         self.start_at = inf  # the common start on the process's clock [s]; infinity before it is known
@@ -141,7 +142,7 @@ class Lifecycle:
         self.moved = self.phase != self._before  # orders between ticks count as well
         self._before = self.phase
         if self.phase == RUNNING:
-            self.settled_until = self.start_at + self._duration - 1e-6
+            self.settled_until = self.start_at + self._ends_after - 1e-6
 
     def _advance(self, t: float, position: Vector, velocity: Vector, flying: bool, ready: bool) -> None:
         if self.phase == IDLE and ready:
@@ -152,7 +153,7 @@ class Lifecycle:
             self.phase, self.climbing = AIRBORNE, False
         if self.phase == AIRBORNE and t >= self.start_at - 1e-6:
             self.phase = RUNNING
-        if self.phase == RUNNING and t - self.start_at >= self._duration - 1e-6:
-            self.land(FINISHED)
+        if self.phase == RUNNING and t - self.start_at >= self._ends_after - 1e-6:
+            self.land(SCRIPTED if self._scripted else FINISHED)
         if self.phase == LANDING and not self.land_due and self._is_down(velocity, flying):
             self.phase = DONE  # set after the body has received the command

@@ -60,7 +60,8 @@ def isolated(plan: Plan) -> Plan:
     """The same without scatter, walls, obstacles, avoidance and shadows, as far as it is flown for `check`."""
     experiment = plan.experiment
     robots = {
-        name: msgspec.structs.replace(robot, shadow=None, sensors=None) for name, robot in experiment.robots.items()
+        name: msgspec.structs.replace(robot, shadow=None, sensors=None, lands_at_s=None)
+        for name, robot in experiment.robots.items()
     }
     bare = plan.changed(
         title="",

@@ -88,6 +88,10 @@ class RobotTable(FileTable, frozen=True):
     ranges: Annotated[Literal["body", "world"], doc("source of its ranges: its own sensors, or the world")] = "body"
     shadow: Annotated[Shadow | None, doc("shadow twin beside the robot")] = None
     avoids: Annotated[bool, doc("whether it keeps clear of others if the experiment has an avoidance")] = True
+    lands_at_s: Annotated[
+        Positive | None,
+        doc("when it lands in mid-run, silent and lost to the others, as after a fault [s]; left out: never"),
+    ] = None
     standby: Annotated[bool, doc("whether it stays out of the run until `./zenpark robot add` lets it join")] = False
 
 

@@ -394,6 +394,7 @@ class Plan:
             pose_every=round(rates.body_hz / rates.pose_hz),
             decide_every=round(rates.body_hz / rates.coordination_hz),
             duration=experiment.duration_s,
+            lands_at=experiment.robots[name].lands_at_s or math.inf,
             number=row,
             count=len(self.names),
             patience_s=None if patient else experiment.start.deadline_s,

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Final
 
-from agents.decision.lifecycle import FINISHED, TOLD_TO_END, Phase
+from agents.decision.lifecycle import FINISHED, SCRIPTED, TOLD_TO_END, Phase
 from agents.network.messages import EMERGENCY, Status
 
 Colour = tuple[int, int, int]
@@ -48,7 +48,7 @@ CONDITIONS: Final[dict[Condition, tuple[str, Colour]]] = {
 RINGED: Final = (Condition.LANDING, *(each for each in Condition if each >= Condition.HELD))
 AT_REST: Final = (Condition.WAITING, Condition.DONE, Condition.OUT)  # their goals are not drawn
 PALED: Final = (Condition.OUT, Condition.SILENT, Condition.STOPPED, Condition.LOST)
-IN_TIME: Final = (FINISHED, TOLD_TO_END, "")  # reasons of a robot that has done all of its plan
+IN_TIME: Final = (FINISHED, SCRIPTED, TOLD_TO_END, "")  # reasons of a robot that has done all of its plan
 
 
 def condition(

@@ -14,7 +14,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from msgspec.structs import replace
 
-from agents.decision.lifecycle import FINISHED, Phase
+from agents.decision.lifecycle import FINISHED, SCRIPTED, Phase
 from agents.decision.stepping import Words
 from agents.network import messages
 from agents.safety.hazards import Outcome
@@ -270,7 +270,9 @@ class RunRecorder:
         """The counters at the end of the run and at the end of everything."""
         log = self._log
         receiver = self._links.receiver[log.received.link]
-        ends = {row: each.text for row, each in log.incidents if each.outcome >= Outcome.LAND}
+        early = [each.lands_at_s or math.inf for each in self._experiment.robots.values()]
+        ends = {row: SCRIPTED for row, at in enumerate(early) if at < self._experiment.duration_s}
+        ends |= {row: each.text for row, each in log.incidents if each.outcome >= Outcome.LAND}
         for end, phase, until in ((self._experiment.duration_s, "landing", ROUNDING_S), (log.ended, "done", math.inf)):
             sent = np.bincount(log.sent.link[log.sent.stamp <= end + until], minlength=len(log.names))
             received = np.bincount(receiver[log.received.arrival <= end + until], minlength=len(log.names))

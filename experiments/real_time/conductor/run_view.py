@@ -12,7 +12,7 @@ from typing import Final, Literal
 import zenoh
 
 from agents.clock import Clock, wait_until
-from agents.decision.lifecycle import FINISHED, TOLD_TO_END, Phase
+from agents.decision.lifecycle import FINISHED, SCRIPTED, TOLD_TO_END, Phase
 from agents.errors import ExplainedError
 from agents.network import endpoints as topology
 from agents.network import lab, messages, pubsub
@@ -36,7 +36,7 @@ ROUTER_S: Final = 10.0  # limit for a router that was just started to answer
 MISSED_S: Final = 1.0  # a robot that changes from one router to another is back sooner
 STILL_S: Final = 3.0  # a recorder without a token for longer than this is killed, and started again
 # beginnings of reasons for a landing that a user or the conductor wanted; every other one is a fault
-ASKED: Final = (FINISHED, "ordered to ", messages.EMERGENCY, TOLD_TO_END)
+ASKED: Final = (FINISHED, SCRIPTED, "ordered to ", messages.EMERGENCY, TOLD_TO_END)
 OUTPUT: Final = "output"  # kind of the events that are a line of a process's output
 
 

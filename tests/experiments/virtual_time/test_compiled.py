@@ -10,11 +10,13 @@ from pathlib import Path
 from types import FunctionType
 from typing import ClassVar
 
+import numpy as np
 import pytest
 
 from agents.body.interface import Disturbance, Jitter
 from agents.body.kinds import KINDS
 from agents.body.limits import Safety
+from agents.decision.lifecycle import Phase
 from agents.decision.stepping import Speech, Stepping
 from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_RELATIVE
 from agents.plugins import registry
@@ -332,7 +334,7 @@ class Counting(Trigger, frozen=True):
 def test_stretches_of_legs_hazards_and_users_laws():
     """The same compilation covers followers of A with different laws, other seeds, and samples of positions alone.
 
-    And a hazard, and a law that fails.
+    And a robot that lands early, a hazard, and a law that fails.
     """
     line = {"kind": "line", "move_by": [0.2, 0.1], "speed": 0.1}
     circle = {"kind": "circle", "radius": 0.3, "period_s": 9.0}
@@ -352,6 +354,9 @@ def test_stretches_of_legs_hazards_and_users_laws():
         }
         return lambda given: replace(given, **parts[given.name])
 
+    lands = changed(made, robots=robots | {"A": changed(robots["A"], lands_at_s=8.0)}, safety=Safety())
+    log, _ = same(lands, change=with_laws(9.0))
+    assert log.phase[np.argmax(log.time > 14.0)].tolist() == [Phase.DONE, Phase.RUNNING, Phase.RUNNING]
     for seed, lean in ((1, False), (2, False), (3, True)):
         log, ticks = same(made, seed=seed, lean=lean, change=with_laws(9.0))
         assert ticks > 1500

@@ -149,6 +149,19 @@ def test_drone_that_lands_is_lost_to_the_formation(architecture, low, planar):
     assert reason.startswith("land: its battery is low") == landed
 
 
+@pytest.mark.parametrize("architecture", ["distributed", "centralised"])
+def test_scripted_landing_silences_and_loses_a_robot(architecture):
+    run = with_drone(architecture, lands_at_s=4.0)
+    log = run.log
+    assert log.time[np.argmax(log.phase[:, 0] == LANDING)] == pytest.approx(4.0, abs=0.03)
+    assert log.phase[np.searchsorted(log.time, 9.0)].tolist() == [DONE, RUNNING, RUNNING]
+    assert log.sent.stamp[log.sent.link == 0].max() < 4.03
+    assert architecture == "centralised" or ("G", "warn: a neighbour is lost: F") in hazards(run.trace)
+    reasons = [status.reason for status in run.recorder.statuses()]
+    assert reasons[:3] == ["lands as its file says", "finished", "finished"]
+    assert not run.metrics.failures
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "code"),
