@@ -31,6 +31,7 @@ CHOSEN: Final = {"kind": "predictive", "threshold": 0.011, "smoothing_s": 0.4}
 MATCHED: Final[dict[str, dict[str, Any]]] = {
     "periodic": {"kind": "periodic", "period_s": 0.02},
     "send-on-delta": {"kind": "send-on-delta", "threshold": 0.01},
+    "periodic, as many": {"kind": "periodic", "period_s": 0.22},  # messages of send-on-delta, not its belief error
     "relative": {"kind": "relative", "share": 0.03},
     "mixed": {"kind": "mixed", "share": 0.0004, "floor": 0.007},
     "decaying": {"kind": "decaying", "floor": 0.008, "extra": 0.02, "rate": 0.3},
@@ -41,6 +42,9 @@ MATCHED: Final[dict[str, dict[str, Any]]] = {
     "predictive": {"kind": "predictive", "threshold": 0.0105},
     "predictive, smoothed": CHOSEN,
     "the same, and 2 s at most": {**CHOSEN, "maximum_silence_s": 2.0},
+    "periodic, as few": {"kind": "periodic", "period_s": 0.8},  # messages of predictive, smoothed
+    "periodic, predicted": {"kind": "periodic", "period_s": 0.26, "prediction": "constant-velocity"},
+    "as few, predicted": {"kind": "periodic", "period_s": 0.8, "prediction": "constant-velocity"},
 }
 UPDATES: Final[dict[str, dict[str, Any] | None]] = {
     "every decision": None,
@@ -74,6 +78,12 @@ def shortest(cases: Sequence[CaseMetrics]) -> float:
     return min(robot.gap_min_s for case in cases for robot in case.robots if robot.gap_min_s is not None)
 
 
+def with_trigger(plan: Plan, choice: dict[str, Any]) -> Plan:
+    """The case with this trigger, and its prediction if one is named."""
+    trigger = {key: value for key, value in choice.items() if key != "prediction"}
+    return plan.changed(trigger=trigger, prediction=choice.get("prediction"))
+
+
 def written(choice: dict[str, Any] | None) -> str:
     """The parameters of a trigger as they stand in an experiment file."""
     parts = {key: value for key, value in (choice or {}).items() if key != "kind"}
@@ -87,7 +97,7 @@ def communication(base: Plan, seeds: Sequence[int]) -> None:
     reference = measured(base.changed(trigger=MATCHED["periodic"]), seeds)
     f, iae, itae = (mean(reference, index) for index in ("f_hz", "iae", "itae"))
     for name, trigger in MATCHED.items():
-        good = measured(case := base.changed(trigger=trigger), seeds)
+        good = measured(case := with_trigger(base, trigger), seeds)
         bad = measured(case.changed(channel=BAD), seeds)
         belief = 1e3 * fmean(each.mean["belief_rms"] or 0.0 for each in good)
         print(

@@ -1,0 +1,31 @@
+"""The README's experiment, its law and its error are what `check` says of them."""
+
+import re
+
+import pytest
+
+from experiments.check.check import check
+from experiments.file.document import load
+from experiments.file.problems import DocumentError
+from tests.commands import ROOT
+
+TEXT = (ROOT / "README.md").read_text("utf-8")
+(FILE,) = re.findall(r"^```toml\n(.*?)^```", TEXT, re.DOTALL | re.MULTILINE)
+(LAW,) = re.findall(r"^```python\n(.*?)^```", TEXT, re.DOTALL | re.MULTILINE)
+
+
+@pytest.mark.parametrize("law", ["", 'law = "my_laws.py:Spring"'])
+def test_example_has_no_finding(law, tmp_path):
+    (tmp_path / "my_laws.py").write_text(LAW, encoding="utf-8")
+    path = tmp_path / "two.toml"
+    path.write_text(FILE.replace("[formation.links]", f"[formation]\n{law}\n[formation.links]"), encoding="utf-8")
+    assert not [finding for finding in check(load(str(path))) if finding.severity in {"error", "warning"}]
+
+
+def test_error_is_shown_as_it_is(tmp_path):
+    path = tmp_path / "two.toml"
+    path.write_text(FILE.replace("threshold =", "treshold ="), encoding="utf-8")
+    with pytest.raises(DocumentError) as failure:
+        load(str(path))
+    shown = re.search(r"^    (two\.toml:.*?)\n\n", TEXT, re.DOTALL | re.MULTILINE)
+    assert str(failure.value).replace(str(tmp_path) + "/", "") in shown[1].replace("\n    ", "\n")
