@@ -76,6 +76,8 @@ class CamerasReader(CaptureReader):
 
     @classmethod
     def parse(cls, address: str) -> tuple[str, int]:
+        if not address:
+            raise file.CamerasFileError("no file of cameras is named")
         return address, 0
 
     @classmethod

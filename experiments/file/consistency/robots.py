@@ -77,7 +77,8 @@ def positioning_faults(experiment: Experiment) -> Iterator[Fault]:
         try:
             readers[capture.system].parse(capture.address)
         except ValueError as error:
-            yield Fault(("positioning", *table), str(error), f"such as {capture.system}://192.168.10.1")
+            example = f"{capture.system}.toml" if readers[capture.system].FILE else "192.168.10.1"
+            yield Fault(("positioning", *table), str(error), f"such as {capture.scheme}://{example}")
     measured = [name for name, robot in experiment.robots.items() if robot.position == "external"]
     for name in capture.names:
         if name not in measured:
