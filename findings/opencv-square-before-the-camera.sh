@@ -3,6 +3,7 @@
 # that is parallel to the image, and returns True. SQPNP is right at all of these places.
 # Guess: within 1 mm and 1 degree at all 9 places, as its documentation recommends it for tags.
 # Seen: IPPE_SQUARE 9 of 9 wrong, by 12 to 180 degrees or NaN; SQPNP 0 of 9
+set -euo pipefail
 place=$(mktemp -d); trap 'rm -rf "$place"' EXIT
 python3 -m venv "$place/venv"
 "$place/venv/bin/pip" install --quiet opencv-python-headless==5.0.0.93
