@@ -239,7 +239,6 @@ def _owners() -> dict[str, str]:
 
 
 @cache
-@cache
 def _literals(base: type) -> dict[str, tuple[object, ...]]:
     """Class variables of a base that have one of a few values, with these."""
     hints = {name: hint for name, hint in get_type_hints(base).items() if get_origin(hint) is ClassVar}

@@ -74,10 +74,18 @@ def run(
 
 
 def parse(prog: str, kind: type[L], arguments: Sequence[str] | None = None) -> L:
-    """A struct from a command line: required fields are positional, the others options of the same name.
+    """A struct from a command line; ends the process on a wrong one."""
+    parser = parser_of(prog, kind)
+    try:
+        return msgspec.convert(vars(parser.parse_args(arguments)), kind, strict=False)
+    except msgspec.ValidationError as error:
+        parser.error(str(error))
 
-    Description and metavar are those of `msgspec.Meta(description=..., title=...)`. Ends the process on a wrong
-    command line.
+
+def parser_of(prog: str, kind: type[msgspec.Struct]) -> argparse.ArgumentParser:
+    """Parser of the fields of a struct: required ones are positional, the others options of the same name.
+
+    Description and metavar are those of `msgspec.Meta(description=..., title=...)`.
     """
     parser = argparse.ArgumentParser(prog=prog, description=(kind.__doc__ or "").partition("\n")[0])
     for field in msgspec.structs.fields(kind):
@@ -94,10 +102,7 @@ def parse(prog: str, kind: type[L], arguments: Sequence[str] | None = None) -> L
             parser.add_argument(field.encode_name, **options)
         else:
             parser.add_argument(f"--{field.encode_name}", dest=field.encode_name, default=argparse.SUPPRESS, **options)
-    try:
-        return msgspec.convert(vars(parser.parse_args(arguments)), kind, strict=False)
-    except msgspec.ValidationError as error:
-        parser.error(str(error))
+    return parser
 
 
 class Output(io.TextIOBase):

@@ -10,7 +10,7 @@ import zenoh
 
 from tests.simulated.entities import Publisher, Query, Subscriber
 from tests.simulated.kernel import current
-from tests.simulated.links import Sample, source_info
+from tests.simulated.links import Sample, SourceInfo
 
 if TYPE_CHECKING:
     from tests.simulated.network import Session
@@ -32,7 +32,7 @@ class AdvancedPublisher(Publisher):
         self._token = session.declare_token(self._place)
 
     def put(self, payload: bytes, *, encoding: object = None, **_: object) -> None:
-        sample = Sample(self.key, payload, encoding or self._mime, source_info(self.id, next(self._count)))
+        sample = Sample(self.key, payload, encoding or self._mime, SourceInfo(self.id, next(self._count)))
         self._cache.append(sample)
         if not self._beating:
             self._beating = True
@@ -115,13 +115,18 @@ class AdvancedSubscriber:
 
     def _source(self, place: str) -> Source:
         zid, number = place.split("/@adv/pub/")[1].split("/")[:2]
-        return self._sources.setdefault(f"{zid}/{number}", Source())
+        return self._known(f"{zid}/{number}")
+
+    def _known(self, name: str) -> Source:
+        if (source := self._sources.get(name)) is None:
+            source = self._sources[name] = Source()
+        return source
 
     def _take(self, sample: Sample) -> None:
         self._sort(sample)
         if sample.source_info is None:
             return
-        name = str(sample.source_info.source_id)
+        name = sample.source_info.source_id
         source = self._sources[name]
         if source.waiting and not source.questions:
             source.questions += 1
@@ -133,7 +138,7 @@ class AdvancedSubscriber:
             self.handler.push(sample)
             return
         number = sample.source_info.source_sn
-        source = self._sources.setdefault(str(sample.source_info.source_id), Source())
+        source = self._known(sample.source_info.source_id)
         if self._first:
             source.waiting[number] = sample
         elif source.last is not None and number != source.last + 1:

@@ -120,7 +120,8 @@ class WatchedBody(Body):
 
     def __init__(self, body: Body, names: Sequence[str], rate_hz: float) -> None:
         self.body, self.names, self.process, self._period_s = body, names, sim.current().process, 1.0 / rate_hz
-        current().bodies.append(self)
+        self._world = current()
+        self._world.bodies.append(self)
 
     def motion(self, row: int) -> Motion | None:
         twins: Sequence[Any] | None = getattr(self.body, "twins", None)
@@ -131,12 +132,12 @@ class WatchedBody(Body):
         self.body.open()
 
     def read(self, t: float) -> Any:
-        readings = current().readings
+        readings = self._world.readings
         for row, name in enumerate(self.names) if readings else ():
             self._carry(row, *readings.get(name, ("", 0.0, {})))
         states = self.body.read(t)
         self._note_motors()
-        if readings and self.process is current().robots.get(self.names[0], self.process):
+        if readings and self.process is self._world.robots.get(self.names[0], self.process):
             for name, state in zip(self.names, states, strict=True):
                 word, number, memory = readings.get(name, ("", 0.0, {}))
                 if word in READINGS:
@@ -156,24 +157,24 @@ class WatchedBody(Body):
         self.body.command(setpoints)
 
     def takeoff(self, rows: Sequence[int], heights: Sequence[float]) -> None:
-        current().rising.update(((self.process.pid, self.names[row]), True) for row in rows)
+        self._world.rising.update(((self.process.pid, self.names[row]), True) for row in rows)
         self._note([self.names[row] for row in rows])
         self.body.takeoff(rows, heights)
 
     def land(self, rows: Sequence[int]) -> None:
         self._note([self.names[row] for row in rows])
-        readings = current().readings
+        readings = self._world.readings
         self.body.land([row for row in rows if readings.get(self.names[row], ("",))[0] != "aloft"])
 
     def stop(self, rows: Sequence[int]) -> None:
-        readings = current().readings
+        readings = self._world.readings
         self.body.stop([row for row in rows if readings.get(self.names[row], ("",))[0] != "deaf"])
         self._note_motors()
 
     def _note_motors(self) -> None:
         for row, name in enumerate(self.names):
             if (motion := self.motion(row)) is not None:
-                current().note_motors(name, motion)
+                self._world.note_motors(name, motion)
 
     def locate(self, row: int, t: float, position: Vector, yaw: float) -> None:
         self.body.locate(row, t, position, yaw)
@@ -186,8 +187,8 @@ class WatchedBody(Body):
 
     def _note(self, names: Sequence[str]) -> None:
         for name in names:
-            current().commands.append((current().now, name, self.process.pid))
-            for watch in current().on_command:
+            self._world.commands.append((self._world.now, name, self.process.pid))
+            for watch in self._world.on_command:
                 watch(name, self.process)
 
 

@@ -90,7 +90,7 @@ def library(net: network.Network) -> SimpleNamespace:
         advanced_subscriber=advanced.AdvancedSubscriber,
         ring=links.Ring,
         callback=lambda call: call,
-        source_info=links.source_info,
+        source_info=links.SourceInfo,
         thread=simulated.Thread,
     )
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import zenoh
 
-from tests.simulated.kernel import Process, Waiters, current
+from tests.simulated.kernel import STEPS, Process, Waiters, current
 from tests.simulated.links import Id, Link, Payload, Sample
 
 if TYPE_CHECKING:
@@ -35,10 +35,14 @@ class Subscriber:
         self.session, self.key, self.table, self.handler = session, key, table, self
         depth = getattr(handler, "depth", None)
         self._waiting: deque[Any] = deque(maxlen=depth)
+        self._kernel = current()
         self.push: Callable[[Any], object] = handler if callable(handler) else self._waiting.append
 
     def try_recv(self) -> Any:
-        current().step()
+        kernel = self._kernel
+        kernel.steps += 1
+        if kernel.steps > STEPS:
+            raise kernel.spins()
         return self._waiting.popleft() if self._waiting else None
 
     def __enter__(self) -> Self:
@@ -64,7 +68,7 @@ class Token:
 class Publisher:
     def __init__(self, session: Session, key: str, mime: object, *, drop: bool = True, express: bool = False) -> None:
         self.session, self.key, self._mime, self._drop, self._express = session, key, mime, drop, express
-        self.id = Id(zid=session.zid(), eid=next(session.network.numbers))
+        self.id = Id(session.zid(), next(session.network.numbers))
 
     def put(self, payload: bytes, *, encoding: object = None, source_info: Any = None, **_: object) -> None:
         sample = Sample(self.key, payload, encoding or self._mime, source_info)

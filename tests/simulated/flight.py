@@ -150,10 +150,10 @@ def _collect(seen: world.World, checked: rules.Rules, request: Request, folder: 
     for t, name, on in seen.motors:
         robots[name].motors.append((since(t), on))
     for name, samples in seen.samples.items():
-        robots[name].samples = [laboratory.Sample(since(t), *rest) for t, *rest in samples]
+        robots[name].samples = [laboratory.Sample(round(t - zero, 6), *rest) for t, *rest in samples]
     for rows, attribute in ((seen.commands, "commands"), (seen.poses, "poses")):
-        for t, name, pid in rows:
-            getattr(robots[name], attribute).append((since(t), pid))
+        for name, track in robots.items():
+            setattr(track, attribute, [(round(t - zero, 6), pid) for t, who, pid in rows if who == name])
     utc = kernel.EPOCH
     metrics = folder / "metrics.json"
     processes = [

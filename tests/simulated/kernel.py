@@ -54,6 +54,7 @@ class Kernel:
         process: The process that runs; None in an event of the world outside.
         crashes: Time [s], process, thread and traceback of each exception that ended a thread.
         log: Time since the beginning [s], process and text of what was said.
+        steps: Number of steps at this instant; what is asked most often counts them without `step`.
     """
 
     def __init__(self, seed: int, preempt: float = 0.0) -> None:
@@ -67,11 +68,10 @@ class Kernel:
         self.tasks: list[Task] = []
         self.crashes: list[tuple[float, str, str, str]] = []
         self.log: list[tuple[float, str, str]] = []
-        self.switches = 0
+        self.switches = self.steps = 0
         self.pids, self.numbers = itertools.count(1001), itertools.count(1)
         self._events: list[tuple[float, int, Callable[..., object], tuple[Any, ...]]] = []
         self._count = itertools.count()
-        self._steps = 0
         self._failure: FlightError | None = None
         self._trace = 0
 
@@ -104,7 +104,7 @@ class Kernel:
         while events and events[0][0] <= limit and not self.stopped:
             t, _, call, args = heappop(events)
             if t > self.now:
-                self.now, self._steps = t, 0
+                self.now, self.steps = t, 0
             call(*args)
             if self._failure is not None:
                 raise self._failure
@@ -120,10 +120,13 @@ class Kernel:
 
     def step(self) -> None:
         """Count a step; a process that takes too many within one instant spins without waiting, which is an error."""
-        self._steps += 1
-        if self._steps > STEPS:
-            self._steps = 0
-            raise self.fail(f"spins without waiting, at {self.now - BEGIN:.4f} s")
+        self.steps += 1
+        if self.steps > STEPS:
+            raise self.spins()
+
+    def spins(self) -> FlightError:
+        self.steps = 0
+        return self.fail(f"spins without waiting, at {self.now - BEGIN:.4f} s")
 
     def fail(self, what: str) -> FlightError:
         """The error, to be raised, with which the flight ends at once."""
@@ -131,11 +134,15 @@ class Kernel:
         self._failure = FlightError(f"{who} {what}")
         return self._failure
 
+    def trace(self, task: Task) -> None:
+        """Note that a wait of a thread is over."""
+        self.switches += 1
+        self._trace = hash((self._trace, self.now, task.process.pid, task.number, task.woken))  # has no random salt
+
     def switch_to(self, task: Task) -> None:
         """Let a thread run until it blocks."""
         self.task, self.process = task, task.process
-        self.switches += 1
-        self._trace = hash((self._trace, self.now, task.process.pid, task.number, task.woken))  # has no random salt
+        self.trace(task)
         try:
             self.step()
             task.greenlet.switch()
@@ -159,11 +166,12 @@ class Task:
     """A thread of a process; it begins by itself."""
 
     def __init__(self, process: Process, call: Callable[[], object], name: str) -> None:
+        kernel = self.kernel = process.kernel
         self.process, self.name, self.done, self.woken = process, name, False, False
-        self.number = next(current().numbers)
+        self.number = next(kernel.numbers)
         self._call, self._ticket = call, 0  # a ticket is good for one wait
+        self.late = False  # True if the wait ends late, as a sleep does
         self.joiners = Waiters()
-        kernel = current()
         self.greenlet = greenlet(self._main, parent=kernel.hub)
         kernel.tasks.append(self)
         kernel.at(kernel.now, self._resume, 0, True)
@@ -178,10 +186,9 @@ class Task:
         self.done = True
         self.joiners.wake()
 
-    def waiter(self) -> Callable[[], None]:
-        """Function that ends the next wait of this thread, and no later one."""
-        ticket, kernel = self._ticket, current()
-        return lambda: kernel.at(kernel.now, self._resume, ticket, True)
+    def waiter(self) -> tuple[Callable[[int, bool], None], int]:
+        """Function that ends the next wait of this thread, and no later one, with its first argument."""
+        return self._resume, self._ticket
 
     def _resume(self, ticket: int, woken: bool) -> None:
         if ticket != self._ticket or self.done or self.process.dead:
@@ -190,14 +197,21 @@ class Task:
             self.process.deferred.append((self._resume, (ticket, woken)))
             return
         self._ticket, self.woken = self._ticket + 1, woken
-        current().switch_to(self)
+        kernel = self.kernel
+        if self.late:
+            self.late = False
+            kernel.trace(self)
+            kernel.at(kernel.now + kernel.rng.expovariate(1.0 / self.process.late), self._resume, self._ticket, False)
+        else:
+            kernel.switch_to(self)
 
-    def block(self, timeout: float | None) -> bool:
-        kernel = current()
+    def block(self, timeout: float | None, *, late: bool = False) -> bool:
+        kernel = self.kernel
         if self.process.dead:  # its `finally` blocks run at the end of a flight
             raise GreenletExit
+        self.late = late
         if timeout is not None:
-            kernel.at(kernel.now + max(0.0, timeout), self._resume, self._ticket, False)
+            kernel.at(kernel.now + (timeout if timeout > 0.0 else 0.0), self._resume, self._ticket, False)
         kernel.hub.switch()
         if self.process.dead:
             raise GreenletExit
@@ -222,11 +236,16 @@ def preempt() -> None:
 def _wait(timeout: float | None, *, late: bool = False) -> None:
     """As `block`, by the clock of the process, on a processor that others use as well."""
     kernel = current()
-    process = kernel.process
+    process, task = kernel.process, kernel.task
     if process is None:
         raise kernel.fail("waits outside of a process")
-    wait = block if kernel.task is None else kernel.task.block
-    wait(None if timeout is None else max(0.0, timeout) / (1.0 + process.drift))
+    if timeout is not None:
+        timeout = timeout / (1.0 + process.drift)
+    if late and task is not None:
+        task.block(timeout, late=True)
+        return
+    wait = block if task is None else task.block
+    wait(timeout)
     if late or process.late > BUSY_S:
         wait(kernel.rng.expovariate(1.0 / process.late))
 
@@ -235,18 +254,20 @@ class Waiters:
     """Threads that wait for one thing."""
 
     def __init__(self) -> None:
-        self._calls: list[Callable[[], None]] = []
+        self._waiting: list[tuple[Callable[[int, bool], None], int]] = []
 
     def wait(self, timeout: float | None = None) -> None:
         task = current().task
         if task is not None:
-            self._calls.append(task.waiter())
+            self._waiting.append(task.waiter())
         _wait(timeout)
 
     def wake(self) -> None:
-        calls, self._calls = self._calls, []
-        for call in calls:
-            call()
+        if self._waiting:
+            waiting, self._waiting = self._waiting, []
+            kernel = current()
+            for resume, ticket in waiting:
+                kernel.at(kernel.now, resume, ticket, True)
 
 
 class Process:
@@ -266,7 +287,7 @@ class Process:
     """
 
     def __init__(self, name: str, main: Callable[[], object], env: Mapping[str, str] | None = None) -> None:
-        kernel = current()
+        kernel = self.kernel = current()
         self.name, self.env, self.pid = name, dict(env or {}), next(kernel.pids)
         self.dead = self.paused = False
         self.code: int | None = None
@@ -346,7 +367,7 @@ class Process:
         if self.paused:
             self.deferred.append((call, args))
             return
-        kernel = current()
+        kernel = self.kernel
         before = kernel.task, kernel.process
         kernel.task, kernel.process = None, self
         try:
@@ -364,12 +385,16 @@ class Process:
 # ---------------------------------------------------------------------- time, threading, select and os
 
 
-def monotonic() -> float:
+def monotonic(_clock: int = 0) -> float:
     """Monotonic clock of the process [s]."""
-    kernel = current()
-    kernel.step()
+    kernel = _kernel
+    assert kernel is not None
+    kernel.steps += 1
+    if kernel.steps > STEPS:
+        raise kernel.spins()
     process = kernel.process
-    return kernel.now if process is None else BEGIN + (kernel.now - BEGIN) * (1.0 + process.drift)
+    drifts = process is not None and process.drift
+    return BEGIN + (kernel.now - BEGIN) * (1.0 + process.drift) if drifts else kernel.now
 
 
 def wall() -> float:

@@ -10,8 +10,7 @@ import itertools
 from collections.abc import Callable
 from functools import lru_cache
 from math import log
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import zenoh
 
@@ -32,21 +31,28 @@ def match(expression: str, other: str) -> bool:
     return bool(zenoh.KeyExpr(expression).intersects(zenoh.KeyExpr(other)))
 
 
-class Id(SimpleNamespace):
-    """Id of an entity of a session: session `zid` and number `eid`."""
+class Id(str):
+    """Id of an entity of a session: session `zid` and number."""
 
-    def __str__(self) -> str:
-        return f"{self.zid}/{self.eid}"
+    zid: str
+
+    def __new__(cls, zid: str, number: int) -> Self:
+        made = super().__new__(cls, f"{zid}/{number}")
+        made.zid = zid
+        return made
 
 
-def source_info(source_id: Id, source_sn: int) -> SimpleNamespace:
+class SourceInfo:
     """As `zenoh.SourceInfo`."""
-    return SimpleNamespace(source_id=source_id, source_sn=source_sn)
+
+    __slots__ = "source_id", "source_sn"
+
+    def __init__(self, source_id: Id, source_sn: int) -> None:
+        self.source_id, self.source_sn = source_id, source_sn
 
 
 class Payload(bytes):
-    def to_bytes(self) -> bytes:
-        return self
+    to_bytes = bytes.__bytes__
 
 
 class Sample:
@@ -149,7 +155,7 @@ class Link:
         """Call a function at the other end, in the order of all calls; it may be lost if `drop`."""
         if not self._open[sender]:
             return
-        kernel, to = current(), self.far if sender is self.near else self.near
+        kernel, to = sender.process.kernel, self.far if sender is self.near else self.near
         now, rng = kernel.now, kernel.rng
         self._sent[sender] = now
         if drop and (sender.loss or to.loss) and rng.random() < max(sender.loss, to.loss):
@@ -196,10 +202,15 @@ class Link:
     def _arrive(self, to: Node, call: Callable[..., object], args: tuple[Any, ...]) -> None:
         if self.near.cut or self.far.cut or self._held[to]:
             self._held[to].append((call, args))
-        elif self._open[to]:
+        elif not self._open[to]:
+            return
+        elif to.process.paused:
             to.process.call(self._receive, to, call, args)
+        else:
+            to.process.call(call, *args)
 
     def _receive(self, to: Node, call: Callable[..., object], args: tuple[Any, ...]) -> None:
+        """What has arrived for a process that was suspended, and goes on."""
         if self._open[to]:
             call(*args)
 

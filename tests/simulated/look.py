@@ -33,13 +33,8 @@ class Seen:
     reason: str  # of its phase
     start: float  # common start, as it knows it [s]; infinity before
     motion: Any  # true motion, with `position` and `flying`; None: simulated by no process
-    runtime: Runtime | None = None  # None: only what it tells is known
+    inside: Runtime = field(default=None)  # None: only what it tells is known
     row: int = 0
-
-    @property
-    def inside(self) -> Runtime:
-        assert self.runtime is not None
-        return self.runtime
 
     @property
     def robot(self) -> Robot:
@@ -60,10 +55,12 @@ class Look:
 
     Attributes:
         slack_s: Added to the limits of rules, on a machine that is busy with other work [s].
+        now: Time of the look, the simulator's [s].
     """
 
     world: World
     slack_s: float = 0.0
+    now: float = 0.0
     since: dict[Hashable, float] = field(default_factory=dict)  # begin of lasting conditions
     sent: dict[tuple[int, str], int] = field(default_factory=dict)  # poses, by process and robot
     phases: dict[tuple[int, str], int] = field(default_factory=dict)
@@ -71,10 +68,6 @@ class Look:
     tokens: dict[str, list[Process]] = field(default_factory=dict)  # who has declared them, at this look
     ran_s: dict[str, float] = field(default_factory=dict)  # time in the experiment, by robot
     held_s: dict[str, float] = field(default_factory=dict)  # time for which it stood then
-
-    @property
-    def now(self) -> float:
-        return self.world.now
 
     @property
     def calm(self) -> bool:
@@ -101,7 +94,8 @@ class Look:
                 continue
             row = runtime._names.index(name)
             life, hazards = runtime.robots[row].lifecycle, runtime.robots[row].hazards
-            held = any(hazards.present >> each & 1 and hazards.level[each] == Outcome.HOLD for each in HOLDING)
+            present, level = hazards.present, hazards.level
+            held = present != 0 and any(present >> each & 1 and level[each] == Outcome.HOLD for each in HOLDING)
             governed = not (runtime.keeper.hands_off or runtime.watchdog.tripped)
             yield Seen(
                 name, process, kinds[name], self.before(name, process, life.phase), life.phase, hazards.worst(), held,

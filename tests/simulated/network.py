@@ -305,10 +305,9 @@ class Session(Node):
         self._told: dict[str, None] = {}  # keys of tokens that have appeared to watches
         self._questions: list[Replies] = []
         self._routes: dict[str, list[Subscriber]] = {}
-        far: Callable[[], list[Node]] = lambda: [] if self.link is None else [self.link.far]  # noqa: E731
         self.info = SimpleNamespace(
-            routers_zid=lambda: [each.zid() for each in far()],
-            transports=lambda: [SimpleNamespace(whatami=ROUTER) for _ in far()],
+            routers_zid=lambda: [] if self.link is None else [self.link.far._zid],
+            transports=lambda: [] if self.link is None else [SimpleNamespace(whatami=ROUTER)],
             peers_zid=list,
             links=list,
             zid=self.zid,

@@ -32,10 +32,10 @@ class Handle:
 
     @property
     def returncode(self) -> int | None:
-        return self.process.code if self.process.dead else None
+        return self.poll()
 
     def poll(self) -> int | None:
-        return self.returncode
+        return self.process.code if self.process.dead else None
 
     def wait(self, timeout: float | None = None) -> int:
         if not self.process.dead:

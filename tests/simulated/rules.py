@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import re
+from functools import partial
 from math import hypot, inf, isfinite
 from pathlib import Path
 
@@ -133,7 +134,7 @@ def landing_without_launcher(look: Look, seen: Seen) -> str:
 @rule(OF_ROBOTS, "")
 def obedience(look: Look, seen: Seen) -> str:
     """Half a second after it was accepted an order is obeyed."""
-    if not look.world.answers or any(each.name == f"second {seen.name}" for each in look.world.processes):
+    if not look.world.answers:
         return ""
     obeys = {
         "land": seen.phase >= LANDING,
@@ -155,6 +156,7 @@ def obedience(look: Look, seen: Seen) -> str:
             and seen.prompt
             and seen.process.started < look.now - age
             and not obeys.get(word, True)
+            and all(each.name != f"second {seen.name}" for each in look.world.processes)
         ):
             return f"accepted `{words}`, and is {Phase(seen.phase).word}, hazard '{seen.hazard}'"
     return ""
@@ -284,7 +286,7 @@ def one_speaker(look: Look, name: str, process: Process) -> str:
 
 @rule(OF_COMMANDS, "A robot is *ready*, and obeys `takeoff`, only when all of the conditions below hold.", inside=True)
 def take_off_on_order(look: Look, name: str, process: Process) -> str:
-    runtime = look.world.runtimes.get(process.pid)
+    runtime = look.world.runtimes.get(process.pid) if look.world.rising else None
     if runtime is None or name not in runtime._names or not look.world.rising.pop((process.pid, name), False):
         return ""
     asked = any(robot == name and look.now - at < 2.5 for at, robot in look.world.takeoffs_ordered)
@@ -304,19 +306,26 @@ class Rules:
         self._look, self._known = look or Look(world), set[tuple[str, str]]()
         self._of_robots = [each for each in OF_ROBOTS if look is None or not each.inside]
         world.watchers.append(self._check)
-        world.on_command.append(lambda name, process: self._use(OF_COMMANDS, name, process))
-        world.on_pose.append(lambda name, process: self._use(OF_POSES, name, process))
+        world.on_command.append(partial(self._use, OF_COMMANDS))
+        world.on_pose.append(partial(self._use, OF_POSES))
 
     def judge(self, folder: Path) -> None:
         """Ask at the end."""
+        self._begin()
         for each in AT_THE_END:
             for text in each.check(End(self._look, folder)):
                 self._violate(each, text.partition(":")[0], text)
 
-    def _check(self) -> None:
+    def _begin(self) -> Look:
+        """Look anew: what was asked before does not count."""
         look = self._look
+        look.now = look.world.now
         look.links.clear()
         look.tokens.clear()
+        return look
+
+    def _check(self) -> None:
+        look = self._begin()
         seen = [*look.seen()]
         self.robot_s += LOOK_S * len(seen)
         for one in seen:
@@ -338,9 +347,9 @@ class Rules:
                 look.held_s[seen.name] = look.held_s.get(seen.name, 0.0) + LOOK_S
 
     def _use(self, rules: list[Rule], name: str, process: Process) -> None:
-        self._look.links.clear()
+        look = self._begin()
         for each in rules:
-            if text := each.check(self._look, name, process):
+            if text := each.check(look, name, process):
                 self._violate(each, name, f"{name}: {text}")
 
     def _violate(self, broken: Rule, who: str, text: str) -> None:

@@ -7,6 +7,7 @@ of `tests.simulated.kernel`, `network` and `processes`.
 from __future__ import annotations
 
 import builtins
+import functools
 import io
 import os
 import secrets
@@ -18,15 +19,17 @@ from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 from typing import Any
 
+import typer
 import zenoh
 
 import agents.clock
 import agents.runtime.router as router_process
 from agents.network import messages, pubsub
 from agents.network import session as network_session
-from agents.plugins import calls
+from agents.plugins import calls, registry
 from agents.runtime import command_line, lifeline, loop, telemetry
 from agents.safety.hazards import Hazards
+from experiments.file import document
 from experiments.real_time.conductor import conduct, orders, run_view
 from experiments.real_time.conductor import conductor as conducting
 from experiments.real_time.hosts import launcher, run_registry
@@ -36,6 +39,7 @@ from experiments.recording import version, writer
 from tests.simulated import advanced, bodies, links, processes
 from tests.simulated import kernel as sim
 from tests.simulated.world import current, running
+from tools import main as command
 from tools import progress as shown_progress
 from tools.commands import run as run_command
 
@@ -45,10 +49,21 @@ MADE = version.provenance("")  # asks git, with a real duration
 def patch() -> None:
     """Replace clocks, threads, signals, disks, pipes and the network of this process by simulated ones, for good."""
     os.environ.pop("ZENPARK_CLOCK", None)
+    _share()
     _patch_clocks_and_threads()
     _patch_processes()
     _patch_network()
     _watch_product()
+
+
+def _share() -> None:
+    """Let all processes share what each real one builds for itself, from the same text and the same classes."""
+    typer.main.get_command = functools.cache(typer.main.get_command)
+    command.part_for = lambda *_: command.app  # the whole application, which is built once
+    command_line.parser_of = functools.cache(command_line.parser_of)
+    registry._fault_of = functools.cache(registry._fault_of)
+    read = functools.cache(document._document)
+    document._document = lambda file, label, text, flags, **more: read(file, label, text, tuple(flags), **more)
 
 
 def _patch_clocks_and_threads() -> None:
@@ -58,7 +73,7 @@ def _patch_clocks_and_threads() -> None:
     time.monotonic = time.perf_counter = sim.monotonic
     time.time, time.sleep = sim.wall, sim.sleep
     time.monotonic_ns = lambda: int(1e9 * sim.monotonic())
-    time.clock_gettime = lambda _: sim.monotonic()
+    time.clock_gettime = sim.monotonic
     time.process_time = lambda: 0.0
     telemetry.resident_mb = lambda: 0.0
     threading.Event, threading.Lock, threading.Thread = sim.Event, sim.Lock, sim.Thread
@@ -112,7 +127,7 @@ def _patch_network() -> None:
     pubsub.pose_publisher = lambda session, key, mime, kept=1: advanced.AdvancedPublisher(session, key, mime, kept)
     pubsub.advanced_subscriber = advanced.AdvancedSubscriber
     pubsub.Callback = lambda function, indirect: function
-    zenoh.SourceInfo = links.source_info
+    zenoh.SourceInfo = links.SourceInfo
     network_session.open_with = lambda chosen: current().network.open(chosen)  # noqa: PLW0108 - of the world that comes
     network_session.forbid_lingering = router_process.forbid_lingering = lambda: 0
     network_session.hang_up = lambda session: session.hang_up()
@@ -137,10 +152,12 @@ def _watch_product() -> None:
 
     def show(self: Any, progress: run_view.Progress) -> None:
         lines(self, progress)
-        current().progress = progress
-        known = current().seen.get(id(progress), 0)
-        current().seen[id(progress)] = len(progress.events)
-        current().events += progress.events[known:]
+        world = current()
+        world.progress = progress
+        known = world.seen.get(id(progress), 0)
+        if known < len(progress.events):
+            world.seen[id(progress)] = len(progress.events)
+            world.events += progress.events[known:]
 
     shown_progress.Lines.__call__ = show
     send = orders.send_order
@@ -204,9 +221,9 @@ def _note_status(_: run_view.NetworkView, status: messages.Status) -> None:
 
 
 def _note_pose(runtime: loop.Runtime, row: int, *_: object, **__: object) -> None:
-    name, process = runtime._names[row], sim.current().process
-    current().poses.append((current().now, name, process.pid))
-    for watch in current().on_pose:
+    name, process, world = runtime._names[row], sim.current().process, current()
+    world.poses.append((world.now, name, process.pid))
+    for watch in world.on_pose:
         watch(name, process)
 
 
