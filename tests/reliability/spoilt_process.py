@@ -205,6 +205,9 @@ class Place:
     def process(self, _: str) -> object:
         return self._process
 
+    def carries(self, *_: object) -> bool:
+        return True
+
     def note_motors(self, *_: object) -> None:
         self.commands.clear()
 

@@ -173,7 +173,7 @@ class WatchedBody(Body):
 
     def _note_motors(self) -> None:
         for row, name in enumerate(self.names):
-            if (motion := self.motion(row)) is not None:
+            if (motion := self.motion(row)) is not None and self._world.carries(name, self.process):
                 self._world.note_motors(name, motion)
 
     def locate(self, row: int, t: float, position: Vector, yaw: float) -> None:

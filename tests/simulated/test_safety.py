@@ -8,6 +8,7 @@ import pytest
 from tests.simulated.faults import Fault
 from tests.simulated.laboratory import fly
 from tests.simulated.small import AT_S, DRONE, TICK_S, TRIO, body, hall
+from tests.simulated.world import LOOK_S
 
 FLIER, WHEELS = "crazyflie", "khepera4"
 LOST = "its own position is lost"
@@ -185,6 +186,16 @@ def test_lost_order_to_land_is_repeated():
     assert end + 2.0 < lost < end + 2.0 + 1.0, "the first two are"
     assert end + 3.0 + 1.5 < flight.robots["C"].off() < end + 3.0 + 2.5
     assert (flight.code, flight.violations) == (0, [])
+
+
+def test_second_process_hides_no_robot():
+    """The rules look at the robot that flies, not at the twin of a process that asks for its name."""
+    deaf = Fault(AT_S, "body", "C", "deaf")
+    flight = fly(DRONE, Fault(AT_S, "twice", "C"), deaf, Fault(2.0, "estop"), settings=["duration_s=4"])
+    assert flight.of("second C")[0].ended > 3.0
+    (told,) = [each for each in flight.violations if each.rule == "emergency-stop"]
+    assert 2.3 < told.t < 2.3 + 2.0 * LOOK_S
+    assert [on for _, on in flight.robots["C"].motors] == [True]
 
 
 CASES = '\n[cases]\nfirst.trigger = "periodic"\nsecond.trigger = "periodic"\n'

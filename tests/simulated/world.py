@@ -242,10 +242,9 @@ class World:
     def motions(self) -> Iterator[tuple[str, sim.Process, Motion]]:
         """True motions of all robots with a living process that simulates them."""
         for body in self.bodies:
-            if not body.process.dead:
-                for row, name in enumerate(body.names):
-                    if (motion := body.motion(row)) is not None:
-                        yield name, body.process, motion
+            for row, name in enumerate(body.names):
+                if self.carries(name, body.process) and (motion := body.motion(row)) is not None:
+                    yield name, body.process, motion
         for process, population in self.populations:
             if not process.dead:
                 for name, carried, motion in zip(
@@ -253,6 +252,11 @@ class World:
                 ):
                     if carried:
                         yield name, process, motion
+
+    def carries(self, name: str, process: sim.Process) -> bool:
+        """Whether the twin of a process is the robot: that of one started by hand is not, while the run's own lives."""
+        own = self.robots.get(name, process)
+        return not process.dead and (process is own or own.dead)
 
     def motion(self, name: str) -> Motion | None:
         """True motion of a robot, of its newest process."""
