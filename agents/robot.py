@@ -233,11 +233,20 @@ class Robot:
     def take(self, t: float, state: BodyState) -> None:
         """Take the state of the body at `t` [s]."""
         self.now.state = state
-        if state.scan is not None and self._perception is not None:
-            self._perception.sees = self._detector.sees = True
+        self.notice()
         if self._stepping is not None:
             self._stepping.scan = state.scan
         self.observe(t)
+
+    def notice(self) -> None:
+        """Take what the range sensors of the body saw last, if it is there to avoid things."""
+        if self._perception is not None:
+            self._perception.notice(self.now.state.scan)
+            self._detector.notice(self.now.state.scan)
+
+    def rare_parts(self) -> list[object]:
+        """Objects that `notice` changes."""
+        return [] if self._perception is None else [self._perception, self._detector]
 
     def observe(self, t: float) -> None:
         """Look at the state of the body, without what jumped; quiet."""

@@ -286,30 +286,46 @@ class TwinBody(Placeable):
         alone = self._alone
         return alone is not None and not (alone.moves_obstacles or self._sensors is not None or self._external)
 
+    @property
+    def together(self) -> bool:
+        """Whether robots move in an engine that they share, and nothing is measured from outside."""
+        return self._alone is None and not self._external
+
+    def move(self, t: float) -> bool:
+        """The part of a step to `t` [s] that all robots make at once, after `begin_step` and before `end_step` of each.
+
+        It sets their range readings; returns whether there are new ones.
+        """
+        self.engine.advance(self._since_start(t), [motion.wobble for motion in self.engine.motions])
+        return self._sweep(t)
+
     def moved_to(self, t: float) -> None:
         """The twins were advanced to `t` [s], and measured, one by one."""
         self._t = t
 
     def _advance(self, t: float) -> None:
         if self._alone is None:
-            self._advance_together(t)
-        else:
             for twin in self.twins:
-                if twin.advance(t, self._dt):
+                twin.begin_step()
+            self.move(t)
+            for twin in self.twins:
+                if twin.end_step(t, self._dt):
                     twin.refill()
-            if self._alone.moves_obstacles:
-                self._alone.move_obstacles(self._since_start(t))
-        if self._sensors is not None and self._sensors.sweep(t, self.engine):
-            for state, scan in zip(self._states, self._sensors.scans, strict=True):
-                state.scan = scan
-
-    def _advance_together(self, t: float) -> None:
+            return
         for twin in self.twins:
-            twin.begin_step()
-        self.engine.advance(self._since_start(t), [motion.wobble for motion in self.engine.motions])
-        for twin in self.twins:
-            if twin.end_step(t, self._dt):
+            if twin.advance(t, self._dt):
                 twin.refill()
+        if self._alone.moves_obstacles:
+            self._alone.move_obstacles(self._since_start(t))
+        self._sweep(t)
+
+    def _sweep(self, t: float) -> bool:
+        """Let range sensors measure; returns whether one was due."""
+        if self._sensors is None or not self._sensors.sweep(t, self.engine):
+            return False
+        for state, scan in zip(self._states, self._sensors.scans, strict=True):
+            state.scan = scan
+        return True
 
     def _since_start(self, t: float) -> float:
         """Time since the common start [s], −inf while that is unknown."""

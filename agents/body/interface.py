@@ -125,6 +125,8 @@ class RangeScan(msgspec.Struct, frozen=True):
 class BodyState:
     """State of the body of one robot; unknown numbers are NaN."""
 
+    RARE: ClassVar = ("scan",)
+
     time: float = nan  # time at which the pose was measured, on the clock of `Body.read` [s]
     position: Vector = UNKNOWN  # measured [m]
     velocity: Vector = UNKNOWN  # measured or estimated [m/s]

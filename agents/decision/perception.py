@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from array import array
+from itertools import chain
 from math import cos, inf, isfinite, sin
-from typing import ClassVar, Final, NamedTuple
+from typing import ClassVar, Final
 
 from agents.body.interface import RangeScan
 from agents.decision.assignment import Assignment
@@ -27,19 +29,14 @@ INSIDE: Final = 0.5  # share of its radius: a shorter reading of a robot is none
 STEEP: Final = 0.5  # cosine of the elevation above which a ray looks up or down, not around
 
 
-class Point(NamedTuple):
-    """End of a range reading in the room."""
-
-    x: float  # [m]
-    y: float
-    height: float  # [m]
-    distance: float  # distance from the robot, when it was measured [m]
+NUMBERS: Final = 3  # numbers of a ray, and of a point
 
 
 class Perception:
     """Inputs of the avoidance of a robot."""
 
     FIXED: ClassVar = ("sees",)
+    RARE: ClassVar = ("scan",)
 
     def __init__(self, assignment: Assignment) -> None:
         assert assignment.avoidance is not None
@@ -59,8 +56,13 @@ class Perception:
         self._horizon = kind.radius + _horizon(self.avoidance, own)  # range of sight from the own axis [m]
         self._in_time = self._horizon + HURRY * own.speed * SCAN_S  # what comes within the horizon before it is old
         self.sees = False  # there are range readings
-        self._scan: RangeScan | None = None
-        self._points: list[Point] = []
+        self.scan: RangeScan | None = None  # the newest ones
+        self._unread = False  # nothing was made of them yet
+        self._scanned = -inf  # their time [s]
+        self._rays = array("d", (0.0,)) * NUMBERS  # bearing and elevation [rad], and distance [m] of each ray
+        self._points = array("d", (0.0,)) * NUMBERS  # ends of rays in the room: x, y and height of each [m]
+        self._close = array("d", (0.0,)) * (1 + self._links)  # numbers of the links of robots that a point may be
+        self._ray_count = self._point_count = self._close_count = 0
 
     def sense(self, t: float, now: Situation, neighbours: Neighbours) -> None:
         """Set `own` and `near` at `t` [s].
@@ -85,14 +87,27 @@ class Perception:
             self._look(t, now, neighbours, aware)
         near.clear_rest(before)
 
+    def notice(self, scan: RangeScan | None) -> None:
+        """Take the newest range readings; rare. Raises ValueError if some of their rays lack a number."""
+        if scan is self.scan:
+            return
+        self.scan = scan
+        self._unread = self.sees = True
+        self._scanned, self._ray_count = -inf, 0
+        if scan is None:
+            return
+        rays = array("d", chain.from_iterable(zip(scan.bearing, scan.elevation, scan.distance, strict=True)))
+        self._scanned, self._ray_count = scan.time, len(rays) // NUMBERS
+        if len(rays) > len(self._rays):  # room for all that may be seen
+            self._rays, self._points = rays[:], rays[:]
+            self.near.reserve(self._links + self._ray_count)
+        self._rays[: len(rays)] = rays
+
     def _look(self, t: float, now: Situation, neighbours: Neighbours, aware: bool) -> None:
-        """Add what the newest range readings saw; rare."""
-        scan = now.state.scan
-        if scan is not self._scan:
-            self._scan = scan
-            self._update_points(scan, now, neighbours)
-            self.near.reserve(self._links + len(self._points))
-        if aware and scan is not None and t - scan.time <= SCAN_S:
+        """Add what the newest range readings saw."""
+        if self._unread:
+            self._read(now, neighbours)
+        if aware and t - self._scanned <= SCAN_S:
             self._add_points(now.position)
 
     def _add_robot(self, t: float, here: Vector, sender: Neighbour) -> None:
@@ -124,18 +139,21 @@ class Perception:
         thing.is_robot = True
         thing.low, thing.high = min(z, 0.0) if lost else low, high
 
-    def _update_points(self, scan: RangeScan | None, now: Situation, neighbours: Neighbours) -> None:
-        """Update the end points of new range readings, by the pose of the robot at their measurement."""
-        self._points = []
-        if scan is None or not (is_finite(now.position) and isfinite(now.yaw)):
+    def _read(self, now: Situation, neighbours: Neighbours) -> None:
+        """Find the end points of new range readings, by the pose of the robot at their measurement."""
+        self._unread, self._point_count = False, 0
+        if not (is_finite(now.position) and isfinite(now.yaw)):
             return
-        then = clamp(now.state.time - scan.time, 0.0, SCAN_S)
-        vx, vy, vz = (each if isfinite(each) else 0.0 for each in now.velocity)
-        x, y, z = now.position[0] - vx * then, now.position[1] - vy * then, now.position[2] - vz * then
-        # those of which a point can be; never received: NaN
-        close = [each for each in neighbours.all if planar(each.position, now.position) <= SIGHT_M + 1.0]
+        then = clamp(now.state.time - self._scanned, 0.0, SCAN_S)
+        (x, y, z), (vx, vy, vz) = now.position, now.velocity
+        x, y = x - (vx if isfinite(vx) else 0.0) * then, y - (vy if isfinite(vy) else 0.0) * then
+        z -= (vz if isfinite(vz) else 0.0) * then
+        self._find_close(now.position, neighbours)
         farthest = min(SIGHT_M, self._in_time)
-        for bearing, elevation, far in zip(scan.bearing, scan.elevation, scan.distance, strict=True):
+        rays, points = self._rays, self._points
+        for k in range(0, NUMBERS * self._ray_count, NUMBERS):
+            bearing, elevation = rays[k], rays[k + 1]
+            far = rays[k + 2]
             # NaN: nothing was hit; nothing is inside the robot either
             if not (INSIDE * self._radius < far <= SIGHT_M and isfinite(bearing) and isfinite(elevation)):
                 continue
@@ -143,20 +161,40 @@ class Perception:
             if flat > STEEP and far * flat <= farthest:
                 out, toward = far * flat, now.yaw + bearing
                 height = z + 0.5 * self._height + far * sin(elevation)
-                point = Point(x + out * cos(toward), y + out * sin(toward), height, far)
-                if not any(_lies_on(point, sender, scan.time) for sender in close):
-                    self._points.append(point)
+                end = x + out * cos(toward), y + out * sin(toward), height
+                if not self._lies_on_robot(end, far, neighbours):
+                    place = NUMBERS * self._point_count
+                    points[place], points[place + 1], points[place + 2] = end
+                    self._point_count += 1
+
+    def _find_close(self, here: Vector, neighbours: Neighbours) -> None:
+        """Find received robots of which a point can be; never received: NaN."""
+        self._close_count = 0
+        for k, sender in enumerate(neighbours.all):
+            if planar(sender.position, here) <= SIGHT_M + 1.0:
+                self._close[self._close_count] = float(k)
+                self._close_count += 1
+
+    def _lies_on_robot(self, end: Vector, far: float, neighbours: Neighbours) -> bool:
+        """Whether the `end` of a ray that is `far` [m] long lies on a received robot."""
+        for k in range(self._close_count):
+            if _lies_on(end, far, neighbours.all[int(self._close[k])], self._scanned):
+                return True
+        return False
 
     def _add_points(self, here: Vector) -> None:
         low, high = -self._clearance, self._height + self._clearance
         near_x, near_y = here[0], here[1]
         squared = self._horizon * self._horizon
-        for point in self._points:
-            off_x, off_y = point.x - near_x, point.y - near_y
-            up = point.height - here[2]
+        points = self._points
+        for k in range(0, NUMBERS * self._point_count, NUMBERS):
+            x, y = points[k], points[k + 1]
+            height = points[k + 2]
+            off_x, off_y = x - near_x, y - near_y
+            up = height - here[2]
             if low < up < high and off_x * off_x + off_y * off_y <= squared:
                 thing = self.near.add()
-                thing.x, thing.y, thing.low, thing.high = point.x, point.y, point.height, point.height
+                thing.x, thing.y, thing.low, thing.high = x, y, height, height
                 thing.velocity_x = thing.velocity_y = thing.radius = thing.lag = 0.0
                 thing.is_robot = False
 
@@ -172,11 +210,11 @@ def _horizon(avoidance: Avoidance, own: OwnState) -> float:
     return horizon
 
 
-def _lies_on(point: Point, sender: Neighbour, time: float) -> bool:
-    """Whether a point that was measured at `time` [s] lies on a received robot."""
+def _lies_on(end: Vector, far: float, sender: Neighbour, time: float) -> bool:
+    """Whether the `end` of a ray that is `far` long [m], and was measured at `time` [s], lies on a received robot."""
     (x, y, z), (vx, vy, vz) = sender.position, sender.velocity
     late = clamp(time - sender.stamp, 0.0, AHEAD_S)
-    off_x, off_y, up = point.x - (x + vx * late), point.y - (y + vy * late), point.height - (z + vz * late)
-    outline = sender.radius + OUTLINE + OUTLINE_SHARE * point.distance
+    off_x, off_y, up = end[0] - (x + vx * late), end[1] - (y + vy * late), end[2] - (z + vz * late)
+    outline = sender.radius + OUTLINE + OUTLINE_SHARE * far
     beside = -OUTLINE < up < sender.height + OUTLINE
     return beside and off_x * off_x + off_y * off_y <= outline * outline

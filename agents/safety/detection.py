@@ -128,6 +128,7 @@ class Detector:
     """Detector of the causes of hazards of one robot."""
 
     FIXED: ClassVar = ("flies", "outside", "sees")
+    RARE: ClassVar = ("scan",)
 
     def __init__(self, assignment: Assignment) -> None:
         kind, limits = assignment.kind, assignment.limits
@@ -189,7 +190,7 @@ class Detector:
                 self.ascent.update(t, status.climbing, state.flying and state.spinning, now.position)
         if status.landing or status.ordered or status.not_finite or status.unguided:
             found |= self.of_orders(now, status)
-        if self.sees and self.sees_nothing(t, state) and status.cruising:
+        if self.sees and t - self.scanned > SCAN_S and status.cruising:
             found |= 1 << Cause.UNSEEING
         self.motion_check.update(t, status.setpoint, now.position, now.yaw, status.cruising and not now.invalid)
         found |= self.of_obedience(now, status)
@@ -331,14 +332,12 @@ class Detector:
             return True
         return self.leaned and state.time > self.leans_since
 
-    def sees_nothing(self, t: float, state: BodyState) -> bool:
-        """Whether the range readings have stopped."""
-        scan = state.scan
+    def notice(self, scan: RangeScan | None) -> None:
+        """Take the newest range readings of a robot that avoids; rare."""
         if scan is not self.scan:
-            self.scan = scan
+            self.scan, self.sees = scan, True
             if scan is not None and len(scan.distance) > 0 and isfinite(scan.time):
                 self.scanned = scan.time
-        return t - self.scanned > SCAN_S
 
     def words(
         self, cause: Cause, now: Situation, status: RobotStatus, neighbours: Neighbours, health: ProcessHealth

@@ -8,7 +8,7 @@ from __future__ import annotations
 from array import array
 from collections.abc import Sequence
 from math import inf, nan
-from typing import Final
+from typing import ClassVar, Final
 
 from agents.decision.neighbours import Neighbour
 from agents.decision.stepping import Speech, Stepping
@@ -207,13 +207,27 @@ class Ledger:
             laws[k + self.memory + j] = value
 
 
+class Stage:
+    """The world that robots share: its engine moves them together, in Python."""
+
+    IN_PYTHON: ClassVar = ("advance",)
+
+    def __init__(self, rows: int) -> None:
+        self.rows = rows  # number of robots
+
+    def advance(self, t: float) -> None:
+        """All robots move on to `t` [s]; see `experiments.virtual_time.steps`."""
+        raise TypeError(t)
+
+
 class Crew:
-    """Members, those of the same layout in lists g0, g1, ..., and the notes of a stretch."""
+    """Members, those of the same layout in lists g0, g1, ..., their world if they share one, and notes of a stretch."""
 
     ledger: Ledger
+    stage: Stage | None
 
-    def __init__(self, groups: Sequence[list[Member]], ledger: Ledger) -> None:
-        self.ledger = ledger
+    def __init__(self, groups: Sequence[list[Member]], ledger: Ledger, stage: Stage | None) -> None:
+        self.ledger, self.stage = ledger, stage
         for k, group in enumerate(groups):
             setattr(self, f"g{k}", group)
 
@@ -222,6 +236,19 @@ def advance(members: list[Member], t: float, dt: float) -> None:
     """Twins move on to `t` [s], and measure."""
     for member in members:
         member.twin.advance(t, dt)
+        member.twin.measure(member.robot.now.state)
+
+
+def begin_step(members: list[Member]) -> None:
+    """First part of a step in a world."""
+    for member in members:
+        member.twin.begin_step()
+
+
+def end_step(members: list[Member], t: float, dt: float) -> None:
+    """Last part of a step in a world to `t` [s], behind its engine's."""
+    for member in members:
+        member.twin.end_step(t, dt)
         member.twin.measure(member.robot.now.state)
 
 

@@ -169,7 +169,7 @@ class Layouts:
         fields, fixed = dict[str, Any](), dict[str, Any]()
         names, rare = getattr(owner, "FIXED", ()), LEFT_OUT | set(getattr(owner, "RARE", ()))
         named, measured = getattr(owner, "NAMED", ()), getattr(owner, "MEASURED", ())
-        for name in (*attributes(owner), *(each for each in getattr(thing, "__dict__", ()) if each not in rare)):
+        for name in [each for each in (*attributes(owner), *getattr(thing, "__dict__", ())) if each not in rare]:
             try:
                 value = getattr(thing, name)
             except AttributeError:  # never set

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import chain
 from typing import Any, Final
 
@@ -27,7 +28,7 @@ from experiments.virtual_time.company import AT_END, AT_HAZARDS, LEAN, PLACES, W
 from experiments.virtual_time.conductor import PATIENCE_S, Stuck, VirtualConductor
 from experiments.virtual_time.network import CentreLog, VirtualNetwork
 from experiments.virtual_time.steps import Steps
-from experiments.virtual_time.stretch import Stretches, stretches_of
+from experiments.virtual_time.stretch import Stretches, TornError, stretches_of
 from twins.arrays import Array, Index
 from twins.body import TwinBody
 from twins.engines.engine import Engine, Touch
@@ -144,17 +145,23 @@ class VirtualRun:
         Args:
             assignments: By the names of robots, of those with a law or a trigger other than the file's.
         """
-        self.plan, self._seed, self.lean = plan, seed, lean
+        self._begin = partial(self._set_up, plan, seed, assignments or {}, quiet=quiet, patience_s=patience_s)
+        self.lean = lean
+        self._begin()
+
+    def _set_up(
+        self, plan: Plan, seed: int, others: Mapping[str, Assignment], *, quiet: bool, patience_s: float
+    ) -> None:
+        self.plan, self._seed = plan, seed
         self.names = names = plan.names
-        others = assignments or {}
         self.robots = [Robot(others.get(name) or plan.assignment(name)) for name in names]
         request = body_request(plan, names, seed, quiet=quiet)
         request = replace(request, external=(False,) * len(names))  # no motion capture in virtual time
         self.twin = TwinBody(request, shared_world(plan, names))
         self._body = shadowed(self.twin, request, shadow_periods(plan, names))
-        self.network = VirtualNetwork(plan, self.robots, seed, lean=lean)
-        # each robot moves by itself, and the network needs no messages
-        self.lonely = self._body is self.twin and self.twin.lonely and self.network.is_quiet
+        self.network = VirtualNetwork(plan, self.robots, seed, lean=self.lean)
+        moves = self.twin.lonely or self.twin.together
+        self.compiles = self._body is self.twin and moves and self.network.is_quiet
         self._laws = [robot.stepping for robot in self.robots]  # those of guided robots are the centre's
         if (centre := self.network.centre) is not None:
             guides = centre.centre.robots
@@ -176,9 +183,21 @@ class VirtualRun:
         self, *, landing: bool, progress: Callable[[float], object], watch: Callable[[Snapshot], object] | None
     ) -> None:
         """Flies until all robots are done, or to the end of the run without `landing`."""
+        try:
+            self._fly(stretches_of(self) if watch is None else None, landing, progress, watch)
+        except TornError:
+            self._begin()
+            self._fly(None, landing, progress, watch)
+
+    def _fly(
+        self,
+        stretches: Stretches | None,
+        landing: bool,
+        progress: Callable[[float], object],
+        watch: Callable[[Snapshot], object] | None,
+    ) -> None:
         conductor, dt = self._conductor, self.dt
-        first = self.robots[0]
-        self.stretches = stretches = stretches_of(self) if watch is None else None
+        first, self.stretches = self.robots[0], stretches
         while not conductor.over:
             reason = AT_END
             if stretches is not None and not self.network.retired:
@@ -327,8 +346,10 @@ class VirtualRun:
         alike = {
             **{what: [getattr(robot.now.state, what) for robot in self.robots] for what in OPTIONAL},
             "phase": [robot.lifecycle.phase for robot in self.robots],
-            "obstacles": [tuple(each) for each in self.twin.engine.obstacles],
         }
+        obstacles = [tuple(each) for each in self.twin.engine.obstacles]
+        moved = [steps.obstacles.get(t, obstacles) for t in ledger.times[:count]]
+        columns.setdefault("obstacles", []).append(np.array(moved).reshape(count, *np.array(obstacles).shape))
         for what, values in alike.items():
             columns.setdefault(what, []).append(np.repeat(np.array(values)[None], count, axis=0))
 

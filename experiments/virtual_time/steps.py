@@ -1,31 +1,45 @@
-"""Rare parts of compiled ticks, called back in Python: steps of laws outside of the subset.
+"""Rare parts of compiled ticks, called back in Python: steps of laws outside of the subset, range readings, engines.
 
-There all that a law may use is at hand. What it reads and writes is copied from the records, and to them.
+There all that Python may use is at hand. What it reads and writes is copied from the records, and to them.
 """
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from agents.decision.goals import GoalComputer
 from agents.decision.stepping import Words
 from agents.plugins.law import is_known
-from experiments.virtual_time.company import Ledger, Member
+from experiments.virtual_time.company import Ledger, Member, Stage
 from experiments.virtual_time.records import MEASURES, Image
 from twins.arrays import Array
+from twins.body import TwinBody
+from twins.engines.engine import Touch
 
 CALL: Final = ctypes.PYFUNCTYPE(ctypes.c_int64, ctypes.c_int64, ctypes.c_int64, ctypes.POINTER(ctypes.c_double))
 
 
-class Steps:
-    """Laws of all robots in stretches."""
+class Rare(NamedTuple):
+    """Rare functions of one object."""
 
-    def __init__(self, members: Sequence[Member]) -> None:
-        self._members = members
+    call: Callable[[int, Any], object]  # given the index of the function, and its numbers
+    reads: Sequence[object]  # objects, of which the records are read before
+    writes: Sequence[object]  # likewise, records that are written behind
+
+
+class Steps:
+    """Calls back of all robots in stretches."""
+
+    def __init__(self, members: Sequence[Member], twin: TwinBody, touches: list[Touch]) -> None:
+        """`touches`: contacts of the run, to which those in stretches are added."""
+        self._members, self._twin, self._touches = members, twin, touches
+        self.stage = Stage(len(members)) if twin.together else None
+        self.obstacles: dict[float, list[tuple[float, ...]]] = {}  # poses of a world's obstacles at each time [s]
         self._laws = [(each.row, law) for each in members if (law := each.robot.stepping) is not None]
         self.measures = list[str]()  # names of measures
         self.error: BaseException | None = None  # error of a law, or interruption
@@ -34,34 +48,55 @@ class Steps:
         self.address = ctypes.cast(self.call, ctypes.c_void_p).value or 0
 
     def board(self, image: Image) -> None:
-        """Find the records of a stretch; what is called back can be undone."""
+        """Find the records of a stretch; calls back can be undone, the motion of a world cannot."""
         self._image, self.error = image, None
         self._begun = None
-        rare = [each.robot.goals for each in self._members if each.robot.stepping or each.robot.goals.changes_shape]
-        self._rare = {image.address(each): each for each in rare}
-        if rare:
-            self._begun = image.words.copy()
+        self._rare = {image.address(thing): rare for thing, rare in self._rare_parts()}
+        if self._rare:
             self._places = {id(thing): (thing, layout, at) for thing, layout, at in image.changing}
+        self.obstacles.clear()
+        if self._rare and self.stage is None:
+            self._begun = image.words.copy()
+
+    def _rare_parts(self) -> Iterator[tuple[object, Rare]]:
+        """Objects of which something is called back."""
+        for member in self._members:
+            robot, goals = member.robot, member.robot.goals
+            if robot.stepping is not None or goals.changes_shape:
+                parts = [goals, *goals.rare_parts()]
+                yield goals, Rare(partial(_step, goals), parts, parts)
+        if self.stage is not None:
+            motions = self._twin.engine.motions
+            yield self.stage, Rare(self._advance, motions, motions)
 
     def _call(self, address: int, which: int, given: Any) -> int:  # noqa: ANN401 - an array of C
-        """A rare function of the goals of a robot; returns 1 after an error."""
+        """A rare function of an object; returns 1 after an error."""
         try:
-            goals = self._rare[address]
-            records = [self._places[id(each)] for each in goals.rare_parts() if id(each) in self._places]
-            for thing, layout, at in records:
-                layout.load(thing, self._image, at)
-            if GoalComputer.RARE[which] == "reshape":
-                elapsed, x, y, z, t = given[:5]
-                goals.reshape(elapsed, (x, y, z), t)
-            else:
-                t, x, y, z, vx, vy, vz, yaw, start = given[:9]
-                goals.step(t, (x, y, z), (vx, vy, vz), yaw, start)
-            for thing, layout, at in records:
-                layout.store(self._image, thing, at)
+            self._within(self._rare[address], which, given)
         except BaseException as error:  # noqa: BLE001 - C cannot pass it on: the stretch is flown again in Python
             self.error = error
             return 1
         return 0
+
+    def _within(self, rare: Rare, which: int, given: Any) -> None:  # noqa: ANN401 - an array of C
+        """Call a rare function between reading and writing records."""
+        image, places = self._image, self._places
+        for thing, layout, at in [places[id(each)] for each in rare.reads if id(each) in places]:
+            layout.load(thing, image, at)
+        rare.call(which, given)
+        for thing, layout, at in [places[id(each)] for each in rare.writes if id(each) in places]:
+            layout.store(image, thing, at)
+
+    def _advance(self, _: int, given: Any) -> None:  # noqa: ANN401 - an array of C
+        """The engine moves all robots on; their sensors see."""
+        t, twin = given[0], self._twin
+        scanned = twin.move(t)
+        self._touches += twin.touches()
+        if twin.engine.obstacles:
+            self.obstacles[t] = [tuple(each) for each in twin.engine.obstacles]
+        for robot in [member.robot for member in self._members] if scanned else ():
+            parts = robot.rare_parts()
+            self._within(Rare(lambda *_, robot=robot: robot.notice(), parts, parts), 0, None)
 
     def undo(self) -> None:
         """Take all that was called back in a stretch back, and what was read from the records for it."""
@@ -88,6 +123,16 @@ class Steps:
                 memory.setdefault(name, blank)[:, row] = table[:, row, begin : begin + len(values)]
                 begin += len(values)
         return memory, measures
+
+
+def _step(goals: GoalComputer, which: int, given: Any) -> None:  # noqa: ANN401 - an array of C
+    """A rare function of the goals of a robot."""
+    if GoalComputer.RARE[which] == "reshape":
+        elapsed, x, y, z, t = given[:5]
+        goals.reshape(elapsed, (x, y, z), t)
+    else:
+        t, x, y, z, vx, vy, vz, yaw, start = given[:9]
+        goals.step(t, (x, y, z), (vx, vy, vz), yaw, start)
 
 
 def words_of(says: Mapping[str, int], values: Sequence[float]) -> Words:

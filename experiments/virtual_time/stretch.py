@@ -25,6 +25,7 @@ from experiments.virtual_time.steps import Steps
 from experiments.virtual_time.translator.kinds import BOOLEAN, DOUBLE, WHOLE, OutsideError
 from experiments.virtual_time.translator.translation import Program
 from twins.body import TwinBody
+from twins.engines.engine import Touch
 
 TICK_S: Final = 15e-6  # [s] CPU time of a tick of a robot in plain Python: 10 to 20 µs
 PAYS_S: Final = 0.3  # [s] work below which plain Python is quicker than to translate and compile
@@ -36,13 +37,17 @@ PAUSE: Final = 10  # ticks that are flown in plain Python, twice as many after t
 LONGEST_PAUSE: Final = 160  # ticks of the longest pause
 ROOM: Final = 2  # more samples on a link than its delay asks for
 LATE, LATEST_S = 40.0, 60.0  # room for jitter: times its mean, of which one in 10¹⁷ is more, and [s]
-STEPS: Final = ("advance", "deliver", "observe", "transmit", "detect", "pursue", "note")
 DRIVER: Final = """
 def stretch(crew, k, end, dt, log_every, instant):
     ledger = crew.ledger
     while k < end:
         t = k * dt
-        {advance}
+        if crew.stage is None:
+            {advance}
+        else:
+            {begin_step}
+            crew.stage.advance(t)
+            {end_step}
         {deliver}
         moves = False
         {observe}
@@ -84,7 +89,8 @@ class Flown(Protocol):
     dt: float  # length of a tick [s]
     log_every: int  # ticks from one sample to the next
     lean: bool  # True for samples of true positions alone
-    lonely: bool  # each robot moves by itself, and the network needs no messages
+    compiles: bool  # bodies and network need nothing outside of the subset but the engine of a world
+    touches: list[Touch]
 
     @property
     def start_at(self) -> float:
@@ -116,11 +122,17 @@ def expect(seconds: float) -> None:
 def possible(flight: Flown) -> bool:
     """Whether the robots of a flight can be flown by compiled functions, unless a plug-in is outside of the subset."""
     says = [robot.stepping.says for robot in flight.robots if robot.stepping is not None]
-    if not flight.lonely or not machine.works() or any(each != flight.network.says for each in says):
+    if not flight.compiles or not machine.works() or any(each != flight.network.says for each in says):
+        return False
+    if says and flight.twin.together:  # laws may read scans
         return False
     if not all(values for robot in flight.robots if robot.stepping for values in robot.stepping.memory.values()):
         return False
     return all(robot.guidance is None for robot in flight.robots)
+
+
+class TornError(Exception):
+    """A stretch that failed in a world, which cannot be taken back: the run must begin again, in Python."""
 
 
 @dataclass
@@ -159,7 +171,7 @@ class Stretches:
             Member(row, robot, twin, sum(says.values()))
             for row, (robot, twin) in enumerate(zip(flight.robots, twins, strict=True))
         ]
-        self._steps, self._ways = Steps(self._members), list[Way]()
+        self._steps, self._ways = Steps(self._members, flight.twin, flight.touches), list[Way]()
         for (robot, k), channel in zip(network.receivers, network.channels, strict=True):
             sender = robot.neighbours.all[k]
             late = min(LATE * channel.jitter, LATEST_S)
@@ -233,6 +245,8 @@ class Stretches:
                 self._steps.undo()
             if isinstance(self._steps.error, KeyboardInterrupt):
                 raise self._steps.error
+            if found < 0 and self._steps.stage is not None:
+                raise TornError
         if found < 0:  # flown plain; that tells an error
             self._refused = True
         elif image is not None:
@@ -242,7 +256,7 @@ class Stretches:
     def _image(self, prepared: Prepared, ledger: Ledger) -> Image | None:
         """All objects in memory, None if they are not of these layouts."""
         self._steps.measures = prepared.driver.program.measures
-        crew = Crew([[self._members[row] for row in rows] for rows in prepared.rows], ledger)
+        crew = Crew([[self._members[row] for row in rows] for rows in prepared.rows], ledger, self._steps.stage)
         try:
             image = Image([(crew, prepared.layout)], prepared.words, self._steps.measures)
         except TypeError as error:
@@ -261,7 +275,7 @@ class Stretches:
         for member in self._members:
             groups.setdefault(layouts.of(member), []).append(member.row)
         rows = [*groups.values()]
-        layout = layouts.of(Crew([[self._members[row] for row in each] for each in rows], ledger))
+        layout = layouts.of(Crew([[self._members[row] for row in each] for each in rows], ledger, self._steps.stage))
         assert layout is not None
         while len(RECENT) >= MAX_RECENT:
             del RECENT[next(iter(RECENT))]
@@ -321,6 +335,8 @@ def driver(crew: RecordLayout, groups: int, names: Sequence[str], *, often: bool
 
         source = DRIVER.format(
             advance=each("advance({}, t, dt)"),
+            begin_step=each("begin_step({})"),
+            end_step=each("end_step({}, t, dt)"),
             deliver=each("deliver({}, t)"),
             observe=each("moves = observe({}, t) or moves"),
             transmit=each("transmit({}, t, ledger)"),

@@ -123,7 +123,10 @@ class Calls(Expressions):
         return places, dict(zip([each.arg or "*" for each in node.keywords], values[first:], strict=True))
 
     def call(self, function: FunctionType, given: list[Value], by_name: Mapping[str, Value], node: ast.AST) -> Value:
-        rare = getattr(getattr(given[0].type, "owner", None), "RARE", ()) if given else ()
+        owner = getattr(given[0].type, "owner", None) if given else None
+        if function.__name__ in getattr(owner, "IN_PYTHON", ()):
+            return self.call_back(given[0], 0, given[1:], node)
+        rare = getattr(owner, "RARE", ())
         if function.__name__ not in rare:
             return self.call_quiet(function, given, by_name, node)
         program, name = self._program, function.__qualname__
@@ -164,11 +167,12 @@ class Calls(Expressions):
         return found
 
     def call_back(self, thing: Value, which: int, given: Sequence[Value], node: ast.AST) -> Value:
-        """Call of a rare function of an object, in Python, with numbers; it returns nothing."""
-        parts = [part for each in given for part in (self.parts(each, node) if each.type != DOUBLE else [each])]
+        """Call of a rare function of an object, in Python, with numbers: objects are there; it returns nothing."""
+        values = [each for each in given if not isinstance(each.type, RecordLayout)]
+        parts = [part for each in values for part in (self.parts(each, node) if each.type != DOUBLE else [each])]
         numbers, name = ", ".join(self.of_type(each, DOUBLE, node).text for each in parts), self.new()
         self.emit(
-            f"double {name}[] = {{{numbers}}};",
+            f"double {name}[] = {{{numbers or '0.0'}}};",
             f"if (back((whole){thing.text}, {which}, {name})) {{ fault = 1; {LEAVE} }}",
         )
         return constant(None)

@@ -38,7 +38,7 @@ class Sight:
         now = Situation()
         now.state = BodyState(t if time is None else time, position, velocity, yaw, scan=scan)
         now.begin(t)
-        self.perception.sees = self.perception.sees or scan is not None
+        self.perception.notice(scan)
         self.perception.sense(t, now, self.neighbours)
         return self.perception.near.things[: self.perception.near.count]
 

@@ -54,7 +54,8 @@ class Watched:
             self.neighbours.update_active(self.t)
             state = BodyState(**{"time": self.t, "received": self.t, "battery": 0.8, **self.values})
             self.now.state = state
-            self.detector.sees = self.detector.sees or (self.avoids and state.scan is not None)
+            if self.avoids:
+                self.detector.notice(state.scan)
             self.now.begin(self.t)
             self.causes = self.detector.causes(self.now, self.status, self.neighbours, self.health)
             if self.causes or self.hazards.under_way:

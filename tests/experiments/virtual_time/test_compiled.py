@@ -26,11 +26,13 @@ from agents.plugins.registry import AVOIDANCES, LAWS, PREDICTORS, TRIGGERS, Plug
 from agents.plugins.triggers import Trigger
 from agents.vectors import UNKNOWN, ZERO, clamp, norm
 from experiments.definition.experiment import (
+    Arena,
     ChangeTable,
     ChannelTable,
     Formation,
     LegTable,
     LinkChannelTable,
+    Obstacle,
     Outage,
     RobotTable,
     WorldTable,
@@ -411,9 +413,40 @@ def test_robots_without_links_are_compiled(channel):
     assert same(follower(formation=Formation(links={}), channel=channel))[1] > 300
 
 
-@pytest.mark.parametrize("parts", [{"channel": ChannelTable(bandwidth=1e5)}, {"world": WorldTable(engine="pymunk")}])
-def test_what_is_not_compiled(parts):
-    assert same(follower(duration_s=1.0, **parts))[1] == 0
+def test_limited_bandwidth_is_not_compiled():
+    assert same(follower(duration_s=1.0, channel=ChannelTable(bandwidth=1e5)))[1] == 0
+
+
+@pytest.mark.parametrize("kind", ["turtlebot3", "crazyflie"])
+@pytest.mark.parametrize("avoidance", [None, "potential", "barrier"])
+def test_worlds_are_compiled_around_their_engine(kind, avoidance):
+    """Robots that touch, see each other, a post and a wall, and an obstacle that moves; two of three seeds are lean."""
+    hover = 0.5 if KINDS[kind].flies else None
+    starts = {"A": [-0.5, 0.0], "B": [0.5, 0.05], "C": [0.0, 0.6]}
+    robots = {name: RobotTable(kind=kind, hover=hover, start=start) for name, start in starts.items()}
+    cart = Obstacle(
+        box=(0.2, 0.2), at=(-0.9, 0.6), height=0.8, plan={"kind": "line", "move_by": [1.8, 0.0], "speed": 0.5}
+    )
+    arena = Arena(size=(3.0, 3.0, 2.5), obstacles={"post": Obstacle(radius=0.1, at=(0.0, -0.6)), "cart": cart})
+    line = {"kind": "line", "move_by": [0.9, -0.5], "speed": 0.2}
+    experiment = follower(
+        robots=robots, arena=arena, world=WorldTable(engine="pymunk"), duration_s=6.0,
+        formation=Formation(links={"A > B": 0.2, "B - C": 0.2}), timeline=[LegTable(at_s=1.0, robot="A", plan=line)],
+        channel=CHANNELS["loss"], avoidance=None if avoidance is None else {"kind": avoidance}, disturbance=NATURE,
+    )  # fmt: skip
+    touches = 0
+    for seed, lean in ((1, False), (2, True), (3, True)):
+        log, ticks = same(experiment, seed=seed, lean=lean)
+        assert ticks > 100
+        touches += len(log.touches)
+    assert touches > 0 or hover is not None or avoidance is not None
+
+
+def test_failure_in_a_world_begins_the_run_again():
+    experiment = follower(duration_s=3.0, world=WorldTable(engine="pymunk"))
+    for _ in range(2):
+        _, ticks = same(experiment, change=lambda given: replace(given, trigger=Growing()))
+        assert ticks == 0
 
 
 def test_changed_constant_of_a_module_counts(monkeypatch):
