@@ -159,6 +159,7 @@ def _figures(analysis: Analysis) -> CheckNumbers:
         residual_mm=_finite(1e3 * shape.worst) if shape else None,
         loop_gain=_finite(loop.gain) if loop else None,
         slowest_mode_s=_finite(loop.slowest_s) if loop else None,
+        remembers=not analysis.is_gradient,
         free_modes=loop.free if loop else 0,
         speed_needed=_finite(fastest[2].speed()) if fastest else None,
         speed_available=None if follower is None else float(analysis.pull[follower]),

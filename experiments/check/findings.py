@@ -68,6 +68,7 @@ class CheckNumbers(msgspec.Struct, frozen=True, kw_only=True):
     residual_mm: float | None  # worst link of the best shape
     loop_gain: float | None  # h·μ·λ_max; the loop is unstable from 2
     slowest_mode_s: float | None  # time constant of the slowest mode that moves
+    remembers: bool  # the law has a memory, so that neither of the two is known
     free_modes: int  # modes that are slower than the run: nothing brings them back in time
     speed_needed: float | None  # speed of the fastest plan [m/s]
     speed_available: float | None  # speed of the slowest follower [m/s]

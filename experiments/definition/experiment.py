@@ -468,6 +468,9 @@ class Experiment(FileTable, frozen=True):
     safety: Annotated[Safety, doc("limits at which robots hold, land or stop")] = Safety()
     start: Annotated[Start, doc("start of a run: its deadline and the scatter of the robots")] = Start()
     criteria: Annotated[list[Criterion], doc("limits that a run must keep to pass; `run` says which it does not")] = []
+    metrics: Annotated[
+        list[str], doc('metrics that are measured without a limit: files beside this, "way.py:Way"')
+    ] = []
     cases: Annotated[
         dict[Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")], dict[str, Any]],
         doc("each may override any field; the first is the reference of every ratio"),

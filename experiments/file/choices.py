@@ -29,8 +29,8 @@ _GROUPS: Final[Mapping[tuple[str | int | type, ...], str]] = {
     ("avoidance",): registry.AVOIDANCES,
     ("world", "engine"): registry.ENGINES,
 }
-_METRIC: Final = ("criteria", int, "metric")  # may be a class in a file, too
-_NAMING: Final = (*_GROUPS, _METRIC)
+_METRICS: Final = (("criteria", int, "metric"), ("metrics", int))  # may be classes in files, too
+_NAMING: Final = (*_GROUPS, *_METRICS)
 
 
 def group_of(path: Path) -> str | None:
@@ -72,8 +72,9 @@ def _with_names(value: Any, path: Path, change: Callable[[str, Path], str]) -> A
     """A part of a document, which stands at `path`, with the name of every chosen plug-in changed, in cases too."""
     inside = path[2:] if path[:1] == ("cases",) else path
     choice = inside[:-1] if inside[-1:] == ("kind",) else inside
-    if isinstance(value, str) and (group_of(choice) or _pattern(inside) == _METRIC):
-        return change(value, path)
+    if isinstance(value, str):
+        of_metric = any(len(inside) == len(to) and _leads(inside, to) for to in _METRICS)
+        return change(value, path) if of_metric or group_of(choice) else value
     if isinstance(value, dict | list) and not any(_leads(inside, to) for to in _NAMING):
         return value  # thousands of robots and links are passed over
     if isinstance(value, dict):

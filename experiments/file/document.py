@@ -39,7 +39,7 @@ __all__ = ["Document", "DocumentError", "Problem"]
 
 UNNAMED: Final = "default"  # the case of an experiment without cases
 TEXT: Final = "text"  # what an experiment is called that stands in no file
-_OF_THE_FILE: Final = ("cases", "criteria")  # keys that no case has
+_OF_THE_FILE: Final = ("cases", "criteria", "metrics")  # keys that no case has
 
 
 @dataclass(frozen=True)
@@ -208,7 +208,7 @@ def case_document(plan: Plan, case: str = UNNAMED) -> bytes:
     """
     arena = msgspec.structs.replace(plan.experiment.arena, file=None)  # what stood there is in it
     cases: dict[str, dict[str, Any]] = {} if case == UNNAMED else {case: {}}
-    bare = plan.changed(arena=arena, hosts={}, criteria=[], cases=cases)
+    bare = plan.changed(arena=arena, hosts={}, criteria=[], metrics=[], cases=cases)
     return msgspec.json.encode(bare.experiment)
 
 

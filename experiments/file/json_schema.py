@@ -63,7 +63,7 @@ def described() -> dict[str, Any]:
     judged = definitions["Criterion"]["properties"]["metric"]
     judged["anyOf"] = [{"enum": judged_metrics()}, {"type": "string", "pattern": f"^{files.CHOICE}$"}]
     partial = {name + CASE: _partial(each) for name, each in definitions.items()}
-    for key in ("cases", "criteria"):
+    for key in ("cases", "criteria", "metrics"):
         del partial["Experiment" + CASE]["properties"][key]
     case = {"$ref": f"#/definitions/Experiment{CASE}"}
     definitions["Experiment"]["properties"]["cases"]["additionalProperties"] = case

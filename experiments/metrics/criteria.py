@@ -9,7 +9,7 @@ import msgspec
 
 from agents.plugins.files import plain
 from experiments.definition.experiment import MEAN, WORST, Criterion
-from experiments.metrics.metric import known_metrics, metrics_of_criteria
+from experiments.metrics.metric import known_metrics, metrics_in_files
 from experiments.metrics.results import CaseMetrics, Judged, RobotMetrics
 from experiments.metrics.statistics import by_case, ratio
 
@@ -42,7 +42,7 @@ class Judgement(msgspec.Struct, frozen=True):
         """The number that is judged, in words."""
         asked = self.criterion
         name = plain(asked.metric or "") or asked.measure
-        metric = (known_metrics() | metrics_of_criteria([asked])[0]).get(name or "")
+        metric = (known_metrics() | metrics_in_files([asked.metric or ""])[0]).get(name or "")
         name = metric.head if metric else name
         where = {MEAN: "", WORST: " of the worst robot"}.get(asked.of, f" of {asked.of}")
         return f"{name}{where} in {self.case or asked.case}"

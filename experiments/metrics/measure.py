@@ -27,7 +27,7 @@ from experiments.metrics.metric import (
     known_metrics,
     law_metrics,
     measures_of,
-    metrics_of_criteria,
+    metrics_of,
     unusable_metrics,
     values_of,
 )
@@ -54,7 +54,7 @@ def measure(trace: Trace) -> CaseMetrics:
     """
     if len(trace.time) < 2:
         raise ValueError(f"case '{trace.case}' holds fewer than two samples: the run ended before it began")
-    asked, missing = metrics_of_criteria(trace.plan.experiment.criteria)
+    asked, missing = metrics_of(trace.plan.experiment)
     metrics, left_out = known_metrics() | asked | law_metrics(measures_of(trace)), unusable_metrics()
     shared = Measurement.of(trace)
     values, faults = values_of(metrics | DETAILS, shared)
@@ -120,6 +120,7 @@ def measure(trace: Trace) -> CaseMetrics:
         measures=_law_measures(trace, mean),
         metric_faults=(*left_out, *missing, *faults),
         criteria=tuple(trace.plan.experiment.criteria),
+        asked=tuple(trace.plan.experiment.metrics),
     )
     return msgspec.structs.replace(found, spoiled=reasons(found))
 

@@ -24,7 +24,7 @@ from agents.errors import did_you_mean
 from agents.plugins import files, registry
 from agents.plugins.calls import supervised
 from agents.plugins.law import Measure
-from experiments.definition.experiment import Criterion
+from experiments.definition.experiment import Criterion, Experiment
 from experiments.definition.plan import Plan
 from experiments.metrics.results import CaseMetrics, RobotMetrics
 from experiments.metrics.signals import Measurement, closest_distance, mean_known
@@ -206,10 +206,10 @@ def known_metrics(cases: Iterable[CaseMetrics] = ()) -> dict[str, Metric]:
 
 
 def swept_metrics(plans: Iterable[Plan] = ()) -> dict[str, Metric]:
-    """Metrics that are columns of sweeps, with those that criteria and laws of these plans name."""
+    """Metrics that are columns of sweeps, with those that these plans and their laws name."""
     found = known_metrics()
     for plan in plans:
-        found |= metrics_of_criteria(plan.experiment.criteria)[0] | law_metrics(plan.law.MEASURES)
+        found |= metrics_of(plan.experiment)[0] | law_metrics(plan.law.MEASURES)
     return {name: metric for name, metric in found.items() if metric.swept}
 
 
@@ -271,18 +271,17 @@ def _elsewhere(_shared: Measurement) -> float:
 
 
 def foreign_metrics(cases: Iterable[CaseMetrics] = ()) -> dict[str, Metric]:
-    """Metrics of other distributions, those in files that criteria of the cases name, and measures of their laws.
+    """Metrics of other distributions, those in files that the cases name, and measures of their laws.
 
-    Of `cases` only those that a criterion names or a case has: others do not apply to them.
+    Of `cases` only those that one names or has: others do not apply to them.
     """
     measured, installed = list(cases), installed_metrics()[0]
-    criteria = [each for case in measured for each in case.criteria]
+    named = [*dict.fromkeys(name for case in measured for name in (*_judged(case.criteria), *case.asked))]
     if measured:
-        named = {each.metric for each in criteria}
         held = {name for case in measured for name in installed if _has_value(case, name)}
-        installed = {name: metric for name, metric in installed.items() if name in named | held}
+        installed = {name: metric for name, metric in installed.items() if name in {*named, *held}}
     measures = {name: Measure(each.unit, each.better) for case in measured for name, each in case.measures.items()}
-    return installed | metrics_of_criteria(criteria)[0] | law_metrics(measures)
+    return installed | metrics_in_files(named)[0] | law_metrics(measures)
 
 
 def _has_value(case: CaseMetrics, name: str) -> bool:
@@ -307,10 +306,19 @@ def terminal_labels(metrics: Mapping[str, Metric]) -> dict[str, str]:
     }
 
 
-def metrics_of_criteria(criteria: Iterable[Criterion]) -> tuple[dict[str, Metric], tuple[str, ...]]:
-    """Metrics in files beside an experiment that its criteria name, by name, and why others cannot be used."""
+def metrics_of(experiment: Experiment) -> tuple[dict[str, Metric], tuple[str, ...]]:
+    """Metrics in files beside an experiment that it names, by name, and why others cannot be used."""
+    return metrics_in_files((*_judged(experiment.criteria), *experiment.metrics))
+
+
+def _judged(criteria: Iterable[Criterion]) -> list[str]:
+    return [each.metric for each in criteria if each.metric]
+
+
+def metrics_in_files(names: Iterable[str]) -> tuple[dict[str, Metric], tuple[str, ...]]:
+    """Metrics in files among these, by name, and why others cannot be used."""
     found, left_out = {}, []
-    for name in dict.fromkeys(each.metric for each in criteria if each.metric):
+    for name in dict.fromkeys(names):
         if files.is_choice(name):
             try:
                 found[files.plain(name)] = usable_metric(name)

@@ -227,6 +227,7 @@ class CaseMetrics(msgspec.Struct, frozen=True):
     measures: dict[str, LawMeasure] = {}  # measures of the law by name, means over the robots in the means
     metric_faults: tuple[str, ...] = ()  # metrics of other distributions that failed or cannot be used, a sentence each
     criteria: tuple[Criterion, ...] = ()  # criteria of the experiment
+    asked: tuple[str, ...] = ()  # metrics that the experiment names without a limit
     judged: tuple[Judged, ...] = ()  # those that are for this case, as written with all cases of the run
 
     @property

@@ -25,7 +25,7 @@ from experiments.metrics.metric import (
     foreign_metrics,
     law_metrics,
     measures_of,
-    metrics_of_criteria,
+    metrics_of,
     swept_metrics,
     values_of,
 )
@@ -95,11 +95,12 @@ def fly(case: bytes, seeds: Sequence[int], code: str, plain_s: float = 0.0) -> b
 
 
 def digest(plan: Plan) -> str:
-    """Digest of an experiment without title, source, cases, criteria and seed; the same if a file spells out a default.
+    """Digest of an experiment without title, source, cases, criteria, metrics and seed.
 
-    Robots and links keep the order of the file, which decides random starts and sums.
+    A file that spells out a default has the same. Robots and links keep the order of the file, which decides random
+    starts and sums.
     """
-    bare = plan.changed(title="", source="", cases={}, criteria=[], seed=0)
+    bare = plan.changed(title="", source="", cases={}, criteria=[], metrics=[], seed=0)
     return hashlib.sha256(msgspec.json.encode(tables(bare.experiment, uniform=True))).hexdigest()[:20]
 
 
@@ -113,7 +114,7 @@ def code_of(plan: Plan) -> str:
     engine = plan.engine_name
     libraries = [engine, *engine_versions(engine), *(engine_versions(library) if library else [])]
     others = sorted(file_digest(file) for file in files if file.parent.parent != ROOT)
-    added = foreign_metrics() | metrics_of_criteria(plan.experiment.criteria)[0]
+    added = foreign_metrics() | metrics_of(plan.experiment)[0]
     others += [f"{name} {file_digest(Path(getfile(type(each))))}" for name, each in added.items()]
     return hashlib.sha256(":".join((digest_of_code(), np.__version__, *libraries, *others)).encode()).hexdigest()[:20]
 

@@ -230,6 +230,7 @@ def _formatted(of: CheckNumbers) -> dict[str, str]:
     def number(value: float | None, form: str, unit: str = "") -> str:
         return "-" if value is None else f"{value:{form}}{unit}"
 
+    of_loop = "not known for a law with a memory" if of.remembers else None
     return {
         "robots": f"{of.robots}, leader: {', '.join(of.leaders) or 'none'}",
         "arena": f"{' × '.join(f'{length:g}' for length in of.arena)} m",
@@ -242,8 +243,9 @@ def _formatted(of: CheckNumbers) -> dict[str, str]:
         "single links it can lose": _redundancy_text(of.spare_links, len(of.vital_links)),
         "single robots it can lose": _redundancy_text(of.spare_robots, len(of.vital_robots)),
         "distances met to": number(of.residual_mm, ".1f", " mm"),
-        "loop gain (unstable from 2)": number(of.loop_gain, ".3g"),
-        "slowest mode": number(of.slowest_mode_s, ".1f", " s to fall to 37 %; acquired is within the tolerance")
+        "loop gain (unstable from 2)": of_loop or number(of.loop_gain, ".3g"),
+        "slowest mode": of_loop
+        or number(of.slowest_mode_s, ".1f", " s to fall to 37 %; acquired is within the tolerance")
         + (f", {of.free_modes} slower than the run: free" if of.free_modes else ""),
         "speed of the fastest plan": number(of.speed_needed, ".3f", " m/s"),
         "speed of the slowest follower": number(of.speed_available, ".3f", " m/s"),

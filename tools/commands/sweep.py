@@ -65,6 +65,10 @@ def sweep(
             help="Optimise values in the ranges instead: 'messages, iae<=1.01' (relative to the first case).",
         ),
     ] = None,
+    metrics: Annotated[
+        list[str] | None,
+        Option("--metrics", metavar="FILE.py:CLASS", help="A metric in a file beside FILE; may be repeated."),
+    ] = None,
     out: Out = None,
     processes: Annotated[int | None, Option(min=1, help="Number at once. [one per core]")] = None,
     scheduler: Annotated[
@@ -81,7 +85,7 @@ def sweep(
     from experiments.sweep import table as tables
     from tools.commands.run import refused
 
-    changes = settings or []
+    changes = [*(settings or []), *added_metrics(file, metrics or [])]
     read = load(file, *changes)
     _parse_axes(read, file, changes, given or [], case or [])
     if code := refused(read, real=False, seeds=2, as_json=as_json, anyway=anyway):
@@ -116,6 +120,15 @@ def sweep(
     if open_report and page is not None and code != INTERRUPTED:
         open_in_browser(page.resolve().as_uri())
     return code
+
+
+def added_metrics(file: str, names: Sequence[str]) -> list[str]:
+    """The `--set` that adds metrics to those of a file; none without names."""
+    from agents.plugins.files import plain
+    from experiments.file.document import inline, load
+
+    known = [plain(name) for name in load(file).experiment.metrics] if names else []
+    return [f"metrics={inline([*known, *names])}"] if names else []
 
 
 def _parse_axes(read: Document, file: str, changes: list[str], given: list[str], cases: list[str]) -> None:

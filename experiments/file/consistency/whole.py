@@ -16,7 +16,7 @@ from experiments.file.consistency import network
 from experiments.file.consistency.arena import arena_faults
 from experiments.file.consistency.formation import formation_faults
 from experiments.file.consistency.robots import positioning_faults, robot_faults
-from experiments.file.problems import Fault, after_the_end, unknown_robot
+from experiments.file.problems import Fault, Path, after_the_end, unknown_robot
 
 
 def consistency_faults(plan: Plan) -> Iterator[Fault]:
@@ -41,22 +41,29 @@ def judged_metrics() -> list[str]:
 
 
 def criteria_faults(experiment: Experiment, cases: Collection[str]) -> Iterator[Fault]:
-    """Faults of the criteria of a file with these cases."""
+    """Faults of the criteria and metrics of a file with these cases."""
+    for number, name in enumerate(experiment.metrics):
+        yield from _metric_faults(name, ("metrics", number))
     for number, each in enumerate(experiment.criteria):
         path = ("criteria", number)
-        if each.metric is not None and files.is_choice(each.metric):
-            try:
-                struct_of(registry.METRICS, each.metric)
-            except registry.PluginError as error:
-                yield Fault((*path, "metric"), str(error), "mend that file (docs/metrics.md)")
-        elif each.metric is not None and each.metric not in (known := judged_metrics()):
-            yield Fault((*path, "metric"), f"no {each.metric!r} among the metrics", did_you_mean(each.metric, known))
+        if each.metric is not None:
+            yield from _metric_faults(each.metric, (*path, "metric"))
         if each.of not in (known := [MEAN, WORST, *experiment.robots]):
             yield Fault((*path, "of"), f"no robot is called '{each.of}'", did_you_mean(each.of, known))
         for key in ("case", "relative_to"):
             name = getattr(each, key)
             if name is not None and name not in cases:
                 yield Fault((*path, key), f"no case '{name}' in this experiment", did_you_mean(name, cases))
+
+
+def _metric_faults(name: str, path: Path) -> Iterator[Fault]:
+    if files.is_choice(name):
+        try:
+            struct_of(registry.METRICS, name)
+        except registry.PluginError as error:
+            yield Fault(path, str(error), "mend that file (docs/metrics.md)")
+    elif name not in (known := judged_metrics()):
+        yield Fault(path, f"no {name!r} among the metrics", did_you_mean(name, known))
 
 
 def _case_names(names: Iterable[str]) -> Iterator[Fault]:

@@ -1,5 +1,7 @@
 """Own laws that remember get what built-in laws get: errors, rows of `check`, coloured links, sweeps, Pareto fronts."""
 
+import re
+
 import msgspec
 import numpy as np
 import pytest
@@ -10,11 +12,13 @@ from experiments.file.problems import DocumentError
 from experiments.metrics.metric import law_metrics
 from experiments.metrics.results import CaseMetrics
 from experiments.report import figures, replay
+from experiments.report.tables import summary_metrics
 from experiments.run import simulate
 from experiments.scene.stage import BARE, LinkTracker, SceneModel
 from experiments.sweep import page, table
 from experiments.sweep.optimise import parse_objective
 from experiments.sweep.sweep import sweep
+from tests.commands import invoke
 
 LAW = '''
 from zenpark import Control, Law, Measure
@@ -130,6 +134,40 @@ def test_check_has_the_same_rows(file):
         for name in ("acquired_s", "end_error_mm", "residual_mm", "smallest_eigenvalue"):
             assert own[name] == pytest.approx(built_in[name], abs=1e-3), name
     assert {"realisable", "rigid", "acquired"} <= {finding.code for finding in findings}
+
+
+def test_check_says_what_it_cannot_know(file):
+    rows = invoke("check", file, "--set", OWN).stdout.splitlines()
+    unknown = [row.strip() for row in rows if row.endswith("not known for a law with a memory")]
+    assert [re.split(" {2,}", row)[0] for row in unknown] == ["loop gain (unstable from 2)", "slowest mode"]
+
+
+def test_metrics_without_a_limit_are_measured(file, tmp_path):
+    """A metric in a file is a column by `--metrics`, and in runs by `metrics` of the file; no criterion names it."""
+    bare = tmp_path / "bare.toml"
+    text = re.sub(r"criteria = .*\n", "", FILE)
+    for name, content in (("place.py", METRIC), ("bare.toml", text)):
+        (tmp_path / name).write_text(content, "utf-8")
+    words = ("trigger.threshold=0.01,0.03", "seeds=1", "--metrics", "place.py:Place", "--processes", "1", "--no-report")
+    said = invoke("sweep", bare, *words, "--out", tmp_path / "swept").stdout
+    assert "Place ratio" in said
+    _, rows, metrics = table.read_json(tmp_path / "swept" / "sweep.json")
+    assert metrics["place.py:Place"].head == "Place [m]"
+    assert rows[0].mean["place.py:Place"].mean == pytest.approx(0.52, abs=0.2)
+    page.pictures(tmp_path, rows, metrics, joined=True, width=3.5)
+    assert (tmp_path / "figures" / "pareto_place.py_Place.svg").is_file()
+    run = simulate(load(bare, 'metrics=["place.py:Place"]'), cases=["periodic"])
+    assert run.metrics["periodic"].mean["place.py:Place"] == pytest.approx(rows[0].mean["place.py:Place"].mean)
+    assert "passed" not in run.summary()
+    report = summary_metrics([*run.metrics.values()])
+    assert "place.py:Place" in report
+    for names, said in {
+        ('metrics=["place.py:Plaice"]',): "it has no Plaice, only Place",
+        ('metrics=["iea"]',): "did you mean 'iae'?",
+        ('cases.event.metrics=["iae"]',): "a case cannot hold metrics",
+    }.items():
+        with pytest.raises(DocumentError, match=re.escape(said)):
+            load(bare, *names)
 
 
 def test_links_have_colours_or_are_grey(file):
