@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from experiments.real_time.conductor.orders import send_run_order
     from experiments.recording.trace import Trace
     from experiments.report import style
-    from experiments.run import folder, reopen, reopen_seeds, show, simulate
+    from experiments.run import fly, folder, reopen, reopen_seeds, show, simulate
     from experiments.sweep import pareto
     from experiments.sweep.sweep import sweep
     from twins.arrays import Array
@@ -62,7 +62,7 @@ __all__ = [  # noqa: RUF022 - by subject, as in docs/python.md
     "load", "loads", "check", "simulate", "sweep", "reopen", "show",
     "Law", "Gradient", "Control", "Said", "Trigger", "Planner", "Metric", "Trace",
     # more of experiments
-    "Document", "figures", "reopen_seeds", "folder", "law_file",
+    "Document", "figures", "reopen_seeds", "folder", "law_file", "fly",
     # learning
     "Environment", "Environments", "SingleAgent",
     # what laws and metrics get and raise

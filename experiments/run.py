@@ -12,14 +12,17 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import msgspec
+
 from agents.errors import ExplainedError
+from agents.plugins.files import plain
 from experiments.arrays import data_frame
 from experiments.cores import KILLED, cores, pool
 from experiments.definition import standby
@@ -30,11 +33,24 @@ from experiments.file.problems import refusal
 from experiments.metrics import comparable, measure
 from experiments.metrics.results import CaseMetrics
 from experiments.recording import playback
-from experiments.recording.cleaning import in_use
+from experiments.recording.cleaning import in_use, using
 from experiments.recording.reader import RecordingError
-from experiments.recording.run_folder import METRICS, SOURCE, SWEEP, case_figures, differences_from_first, read_origin
+from experiments.recording.run_folder import (
+    METRICS,
+    SOURCE,
+    SWEEP,
+    RunOrigin,
+    case_figures,
+    differences_from_first,
+    keep_origin,
+    new_folder,
+    read_origin,
+    remove_unused,
+)
 from experiments.recording.trace import Trace
+from experiments.recording.version import provenance
 from experiments.report import metrics_files
+from experiments.report.page import date_of
 from experiments.virtual_time import simulation, stretch
 from experiments.virtual_time.log import RunRecorder
 
@@ -146,6 +162,61 @@ def simulate(
         RecordingError: If a recording cannot be written.
     """
     return simulate_seeds(read, [read.experiment.seed if seed is None else seed], cases=cases, folder=folder)[0]
+
+
+def fly(
+    read: Document, *, cases: Sequence[str] = (), folder: str | Path | None = None, bodies: str | None = None
+) -> Run:
+    """Runs an experiment in real time, with simulated bodies: a process for each robot, as `./zenpark run`.
+
+    Its file goes into the folder, with the Python files that it names. A law of a notebook's cell is such a file, too,
+    as a printed line says. Ctrl-C, or the notebook's button, lets all robots land; a second one ends the run at once.
+
+    Args:
+        cases: Which of its cases; all if none is named.
+        folder: Folder of the results; a new one below `runs` if left out.
+        bodies: "twin", "world" or "protocol" in place of the file's bodies.
+
+    Raises:
+        DocumentError: If the check finds errors, for real robots or other machines, a case that is none, and a folder
+            that holds something.
+        RunFailed: If robots are not ready in time.
+    """
+    # simulations need no network
+    from agents.runtime.command_line import interrupts  # noqa: PLC0415
+    from experiments.check.check import check  # noqa: PLC0415
+    from experiments.real_time.conductor.conduct import (  # noqa: PLC0415
+        RunOptions,
+        Supervision,
+        conduct,
+        hardware,
+        with_bodies,
+    )
+
+    options = RunOptions(cases, bodies)
+    if read.experiment.hosts or any(hardware(with_bodies(read, options).values()).values()):
+        hint = 'write the law with `law_file`, then `./zenpark run FILE` in a terminal; or give bodies="twin"'
+        raise refusal(str(read.path), "real robots and other machines are not for a notebook", hint)
+    if errors := [str(each) for each in check(read, cases) if each.severity == "error"]:
+        raise refusal(str(read.path), errors[0], f"`check` says more: {len(errors)} in all")
+    place = new_folder(read, None if folder is None else str(Path(folder).expanduser()))
+    begun, changes = time.time(), [plain(each.flag) for each in read.source.overrides]
+    origin = RunOrigin(file=str(read.path), cases=[*cases], changes=changes, bodies=bodies, begun=begun,
+                       title=read.experiment.title, date=date_of(begun), made_by=provenance(read.text))  # fmt: skip
+    try:
+        read.keep(place / SOURCE)
+        keep_origin(place, origin)
+        for name in sorted({plain(choice).partition(":")[0] for choice in read.plugins}):
+            print(f"{place / name}: what flies of this file")
+        with using(place), interrupts() as interrupted:
+            user = Supervision(nullcontext(lambda _: None), interrupted, tell=lambda lines: print(*lines, sep="\n"))
+            ended = conduct(read, place, options, user)
+        keep_origin(place, msgspec.structs.replace(origin, ended=time.time(), failures=ended.failures))
+        run = read_back(place, ended.recordings, ended.notes, ended.failures)
+        metrics_files.write_json(place / METRICS, [*run.metrics.values()])
+        return run
+    finally:
+        remove_unused(place)
 
 
 class Unrecorded(RecordingError):

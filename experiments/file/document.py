@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
@@ -112,13 +112,14 @@ def load(file: str | Path, *overrides: str, law: Law | type[Law] | None = None) 
     plugin = law if isinstance(law, type) else type(law)
     with TemporaryDirectory() as folder:
         try:
-            kind, _ = files.adopt(law_file(plugin, folder), Path(folder))
+            kind, copy = files.adopt(law_file(plugin, folder), Path(folder))
         except registry.PluginError as error:
             raise refusal(f"law={plugin.__name__}", *str(error).split("; ", 1)) from None
     given = {"kind": kind}
     if not isinstance(law, type):
         given |= {name: each for name, each in msgspec.to_builtins(law).items() if each is not None}
-    return read(file, (*overrides, f"formation.law={inline(given)}"))
+    found = read(file, (*overrides, f"formation.law={inline(given)}"))
+    return replace(found, plugins={**found.plugins, kind: copy})
 
 
 def inline(value: Any) -> str:  # noqa: ANN401 - a parameter of a plug-in

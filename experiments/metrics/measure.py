@@ -54,7 +54,7 @@ def measure(trace: Trace) -> CaseMetrics:
     """
     if len(trace.time) < 2:
         raise ValueError(f"case '{trace.case}' holds fewer than two samples: the run ended before it began")
-    asked, missing = metrics_of(trace.plan.experiment)
+    asked, missing = metrics_of(trace.plan)
     metrics, left_out = known_metrics() | asked | law_metrics(measures_of(trace)), unusable_metrics()
     shared = Measurement.of(trace)
     values, faults = values_of(metrics | DETAILS, shared)

@@ -24,7 +24,7 @@ from agents.errors import did_you_mean
 from agents.plugins import files, registry
 from agents.plugins.calls import supervised
 from agents.plugins.law import Measure
-from experiments.definition.experiment import Criterion, Experiment
+from experiments.definition.experiment import Criterion
 from experiments.definition.plan import Plan
 from experiments.metrics.results import CaseMetrics, RobotMetrics
 from experiments.metrics.signals import Measurement, closest_distance, mean_known
@@ -209,7 +209,7 @@ def swept_metrics(plans: Iterable[Plan] = ()) -> dict[str, Metric]:
     """Metrics that are columns of sweeps, with those that these plans and their laws name."""
     found = known_metrics()
     for plan in plans:
-        found |= metrics_of(plan.experiment)[0] | law_metrics(plan.law.MEASURES)
+        found |= metrics_of(plan)[0] | law_metrics(plan.law.MEASURES)
     return {name: metric for name, metric in found.items() if metric.swept}
 
 
@@ -306,9 +306,9 @@ def terminal_labels(metrics: Mapping[str, Metric]) -> dict[str, str]:
     }
 
 
-def metrics_of(experiment: Experiment) -> tuple[dict[str, Metric], tuple[str, ...]]:
+def metrics_of(plan: Plan) -> tuple[dict[str, Metric], tuple[str, ...]]:
     """Metrics in files beside an experiment that it names, by name, and why others cannot be used."""
-    return metrics_in_files((*_judged(experiment.criteria), *experiment.metrics))
+    return metrics_in_files((*_judged(plan.experiment.criteria), *plan.experiment.metrics))
 
 
 def _judged(criteria: Iterable[Criterion]) -> list[str]:

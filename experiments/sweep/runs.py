@@ -114,7 +114,7 @@ def code_of(plan: Plan) -> str:
     engine = plan.engine_name
     libraries = [engine, *engine_versions(engine), *(engine_versions(library) if library else [])]
     others = sorted(file_digest(file) for file in files if file.parent.parent != ROOT)
-    added = foreign_metrics() | metrics_of(plan.experiment)[0]
+    added = foreign_metrics() | metrics_of(plan)[0]
     others += [f"{name} {file_digest(Path(getfile(type(each))))}" for name, each in added.items()]
     return hashlib.sha256(":".join((digest_of_code(), np.__version__, *libraries, *others)).encode()).hexdigest()[:20]
 

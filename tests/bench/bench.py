@@ -7,12 +7,13 @@ from typing import Annotated, Final
 
 import typer
 
-from tests.bench import measuring, process, reactions
+from tests.bench import learning, measuring, process, reactions
 from tools.options import AsJson, known_words, print_json
 
 BENCHMARKS: Final = {
     "start": measuring.start,  # time until a command answers
     "virtual": measuring.virtual,  # the reference experiment in virtual time
+    "learning": learning.learning,  # decisions in an environment
     "process": process.process,  # CPU and memory of robot processes
     "safety": reactions.safety,  # reaction times
 }
