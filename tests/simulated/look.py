@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator, Set
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -140,10 +140,22 @@ class Look:
         """Kinds of the faults of the script."""
         return {fault.kind for fault in self.world.script}
 
-    @cached_property
-    def lies(self) -> bool:
-        """Whether the script lets robots believe what is not true."""
-        return bool(self.kinds & {"body", "capture", "step"})
+    def spoiled(self, kinds: Set[str], *names: str) -> bool:
+        """Whether the script has faults of these kinds, of these processes or of robots that share one with them."""
+        if not self.kinds & kinds:
+            return False
+        assert self.world.plan is not None
+        robots = self.world.plan.experiment.robots
+        meant = [robots[name] for name in names if name in robots]
+        shared = {robot.process for robot in meant} - {None}
+        others = {name for name, robot in robots.items() if robot.process in shared}
+        others |= {"world"} if any(robot.body == "world" for robot in meant) else set()
+        hit = {
+            fault.who.rstrip("23") if "router" in fault.who else fault.who
+            for fault in self.world.script
+            if fault.kind in kinds
+        }
+        return bool(hit & {*names, *others})
 
     @cached_property
     def bent(self) -> bool:

@@ -18,6 +18,7 @@ from tests.simulated.kernel import Process
 from tests.simulated.look import AT_THE_END, OF_COMMANDS, OF_PAIRS, OF_POSES, OF_ROBOTS, Look, Rule, Seen, rule
 from tests.simulated.world import LOOK_S, World
 
+LIES = {"body", "capture", "step"}  # faults that let a robot believe what is not true
 HELD = ("hold", "land", "cut")  # worst hazards with which a robot does not go on
 
 
@@ -30,7 +31,7 @@ def emergency_stop(look: Look, seen: Seen) -> str:
     at = min(look.world.stops, default=inf)
     if look.now <= at + 0.3 + look.slack_s or seen.process.started > at or not seen.flying or not seen.prompt:
         return ""
-    apart = look.kinds & {"pause", "kill", "late", "hang"}
+    apart = look.spoiled({"pause", "kill", "late", "hang"}, seen.name, "router", "conductor")
     return "" if apart else f"motors on {look.now - at:.2f} s after the emergency stop"
 
 
@@ -42,7 +43,7 @@ def final_landing(_: Look, seen: Seen) -> str:
 
 @rule(OF_ROBOTS, "| more than 0.25 m outside the arena | | land | |")
 def inside_the_arena(look: Look, seen: Seen) -> str:
-    if seen.motion is None or look.lies:
+    if seen.motion is None or look.spoiled(LIES, seen.name):
         return ""
     assert look.world.plan is not None
     (x, y, z), size = seen.motion.position, look.world.plan.experiment.arena.size
@@ -246,7 +247,9 @@ def common_start(look: Look, seen: Seen) -> str:
 @rule(OF_PAIRS, "An `avoidance` keeps clear of its last known position, from the floor up")
 def contact(look: Look, one: Seen, other: Seen) -> str:
     assert look.world.plan is not None
-    if look.world.plan.experiment.avoidance is None or look.lies or one.motion is None or other.motion is None:
+    if look.world.plan.experiment.avoidance is None or one.motion is None or other.motion is None:
+        return ""
+    if look.spoiled(LIES, one.name, other.name):
         return ""
     p, q = one.motion.position, other.motion.position
     beside = hypot(p[0] - q[0], p[1] - q[1]) < one.kind.radius + other.kind.radius
