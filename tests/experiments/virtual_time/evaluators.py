@@ -1,6 +1,6 @@
 """Runs flown in plain Python, by compiled functions, or read back from their recordings, which must be the same."""
 
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from math import isnan
 
 import msgspec
@@ -16,8 +16,8 @@ def evaluated(experiment, *, compiled, seed=1, lean=False, change=None):
     """Log of a run with changed assignments, and the ticks of it that were compiled."""
 
     class Changed(Plan):
-        def assignment(self, name):
-            given = super().assignment(name)
+        def assignment(self, name, **how):
+            given = super().assignment(name, **how)
             return given if change is None else change(given)
 
     stretch.WORK[0] = 1e6 if compiled else -1e6  # compilation pays, or nothing does
@@ -54,6 +54,8 @@ def alike(one, other, within=0.0):
     """Whether two values are the same, numbers to a tolerance; unknown ones are the same."""
     if isinstance(one, msgspec.Struct):
         one, other = msgspec.structs.astuple(one), msgspec.structs.astuple(other)
+    if is_dataclass(one):
+        one, other = (tuple(getattr(each, field.name) for field in fields(each)) for each in (one, other))
     if isinstance(one, dict):
         return one.keys() == other.keys() and all(alike(one[name], other[name], within) for name in one)
     if isinstance(one, tuple):

@@ -25,6 +25,7 @@ from agents.plugins.laws import Gradient
 from agents.plugins.registry import AVOIDANCES, LAWS, PREDICTORS, TRIGGERS, PluginError
 from agents.plugins.triggers import Trigger
 from agents.vectors import UNKNOWN, ZERO, clamp, norm
+from experiments.catalogue import index
 from experiments.definition.experiment import (
     Arena,
     ChangeTable,
@@ -37,6 +38,7 @@ from experiments.definition.experiment import (
     RobotTable,
     WorldTable,
 )
+from experiments.file import document
 from experiments.virtual_time import machine, stretch
 from experiments.virtual_time.translator.calls import NEW_SUMS
 from tests.agents.plugins.test_every_plugin import made as plugin
@@ -440,6 +442,16 @@ def test_worlds_are_compiled_around_their_engine(kind, avoidance):
         assert ticks > 100
         touches += len(log.touches)
     assert touches > 0 or hover is not None or avoidance is not None
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", index.names())
+def test_cases_of_the_catalogue(name):
+    """Every case with three seeds; those with a central controller are flown plain."""
+    for case in document.read(name).cases().values():
+        for seed in range(1, 4):
+            same(case.experiment, seed=seed, lean=seed > 1)
+    stretch.REFUSED.clear()
 
 
 def test_failure_in_a_world_begins_the_run_again():
