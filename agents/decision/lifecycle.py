@@ -6,11 +6,11 @@ Orders and facts go in, phases and commands to the body come out. `advance` is q
 from __future__ import annotations
 
 from enum import IntEnum
-from math import inf
+from math import inf, nan
 from typing import Final
 
 from agents.body.kinds import Kind
-from agents.vectors import Vector
+from agents.vectors import Vector, distance, norm
 
 
 class Phase(IntEnum):
@@ -39,6 +39,24 @@ SCRIPTED: Final = "lands as its file says"
 TOLD_TO_END: Final = "asked to end"
 PAUSED: Final = "ordered to hold"
 SETTLED: Final = 0.1  # [m/s] slower: climbing or rolling has ended
+STANDS: Final = 0.02  # [m/s] slower: wheels stand
+STANDS_S: Final = 0.5  # [s] time after which wheels stand that have rolled no farther than
+ROLLED: Final = 0.01  # [m]
+
+
+class Standing:
+    """Whether a robot on wheels stands: by its velocity or, as that may be noisy, by its places over half a second."""
+
+    def __init__(self) -> None:
+        """Of a robot of which nothing was measured yet."""
+        self._place, self._since = (nan, nan, nan), inf
+
+    def stands(self, t: float, place: Vector, velocity: Vector) -> bool:
+        """Whether it stands at `t` [s]; an unknown velocity counts as slow."""
+        if not distance(place, self._place) <= ROLLED:
+            self._place, self._since = place, t
+        speed = norm(velocity)
+        return not speed >= STANDS or (speed < SETTLED and t - self._since >= STANDS_S)
 
 
 class Lifecycle:

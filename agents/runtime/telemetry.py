@@ -18,14 +18,13 @@ import msgspec
 import zenoh
 
 from agents.body.interface import UNANSWERED, BodyState
-from agents.decision.lifecycle import SETTLED, Phase
+from agents.decision.lifecycle import Phase, Standing
 from agents.decision.stepping import Stepping
 from agents.network import messages, pubsub
 from agents.network.keys import Keys
 from agents.robot import Robot
 from agents.runtime import range_inbox
 from agents.runtime.pose_inbox import PoseInbox
-from agents.vectors import norm
 
 STATUS_S: Final = 1.0
 ROUNDING_S: Final = 1e-6
@@ -91,9 +90,8 @@ class TelemetryPublisher:
         self._reported: list[tuple[object, ...]] = [()] * len(names)
         self._incidents: list[deque[messages.Incident]] = [deque(maxlen=INCIDENTS) for _ in names]
         self._numbers = [0] * len(names)
-        self._at_rest = [False] * len(
-            names
-        )  # True if the body has confirmed that its motors are off, or its wheels stand
+        # whether wheels stand after the end; None once the body has confirmed that, or that its motors are off
+        self._resting: list[Standing | None] = [Standing() for _ in names]
 
     def send_states(self, t: float) -> None:
         """Sends the state of every robot, also of one without a known position."""
@@ -155,7 +153,7 @@ class TelemetryPublisher:
         """
         counts = self._counts
         for row, robot in enumerate(self._robots):
-            waited = robot.lifecycle.phase == Phase.DONE and not self._at_rest[row]
+            waited = robot.lifecycle.phase == Phase.DONE and self._resting[row] is not None
             changed = changed or robot.lifecycle.moved or waited or bool(robot.hazards.incidents)
         if not (everything or changed):
             return
@@ -221,11 +219,13 @@ class TelemetryPublisher:
         robot = self._robots[row]
         phase, state = robot.lifecycle.phase, robot.now.state
         if phase != Phase.DONE:
-            self._at_rest[row] = False
-        elif not self._at_rest[row]:
-            rolls = not robot.assignment.kind.flies and norm(robot.now.velocity) >= SETTLED
-            self._at_rest[row] = not (state.flying or rolls or UNANSWERED in state.note)
-        return int(Phase.LANDING) if phase == Phase.DONE and not self._at_rest[row] else phase
+            self._resting[row] = Standing()
+        elif resting := self._resting[row]:
+            now = robot.now
+            rolls = not robot.assignment.kind.flies and not resting.stands(now.t, now.position, now.velocity)
+            if not (state.flying or rolls or UNANSWERED in state.note):
+                self._resting[row] = None
+        return int(Phase.LANDING) if phase == Phase.DONE and self._resting[row] else phase
 
     def _note_incidents(self) -> None:
         """Moves incidents from the decision into statuses, and prints them: the log outlives the network."""

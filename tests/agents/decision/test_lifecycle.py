@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agents.decision.lifecycle import AIRBORNE, DONE, IDLE, LANDING, READY, RUNNING, Lifecycle, Phase
+from agents.decision.lifecycle import AIRBORNE, DONE, IDLE, LANDING, READY, RUNNING, Lifecycle, Phase, Standing
 from bridges.crazyflie.kind import CRAZYFLIE
 from bridges.khepera4.kind import KHEPERA4
 from tests.cases import examples, for_each
@@ -184,3 +184,24 @@ def test_idle_and_ready_follow_what_is_missing():
     robot.ready = False  # what is missing while it climbs changes nothing
     life.set_missing("its battery is low")
     assert robot.until(AIRBORNE).life.reason == ""
+
+
+@pytest.mark.parametrize(
+    ("speed", "noise", "stands"),
+    [
+        (0.0, 0.0, True),
+        (0.05, 0.0, False),  # a robot that drives on slowly was told to have stopped
+        (0.03, 0.0, False),
+        (0.0, 0.05, True),  # a velocity that positions were made into
+        (0.2, 0.0, False),
+        (0.0, nan, True),
+    ],
+)
+def test_wheels_stand_when_their_place_stays(speed, noise, stands):
+    standing = Standing()
+    found = [
+        standing.stands(t, (speed * t, 0.0, 0.0), (speed + (-1) ** tick * noise, 0.0, 0.0))
+        for tick, t in enumerate(0.02 * step for step in range(100))
+    ]
+    assert found[-1] == stands
+    assert any(found) == stands
