@@ -124,22 +124,22 @@ class Descent:
             self._body.close()
 
     def _land(self) -> None:
-        """Lands robots that still fly after an error, before the motors are switched off."""
+        """Lands robots that still fly, after an error or too late, before the motors are switched off.
+
+        The others learn of an error at once, of a robot on wheels too: its body may be beyond reach, and drive on.
+        """
         if self._keeper.hands_off:
             return
         self.begun = True
         self.watchdog.start()
         failures: list[Exception] = []
-        if self._in_the_air(failures) and any(
-            robot.lifecycle.phase < Phase.DONE for robot in self._robots
-        ):  # else it was stopped
-            error = sys.exception()
-            why = (
-                "it did not land in time"
-                if error is None
-                else f"its control loop broke: {type(error).__name__}: {error}"
-            )
-            self.watchdog.call_for_help(why)
+        lives, error = [robot.lifecycle for robot in self._robots], sys.exception()
+        falls = self._in_the_air(failures) and any(life.phase < Phase.DONE for life in lives)  # else it was stopped
+        if error is not None and (falls or any(life.in_motion for life in lives)):
+            self.watchdog.call_for_help(f"its control loop broke: {type(error).__name__}: {error}")
+        elif falls:
+            self.watchdog.call_for_help("it did not land in time")
+        if falls:
             self._order_down(self._body.land, self.limit_s)
         if failures:
             raise failures[0]

@@ -5,6 +5,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from itertools import repeat
@@ -13,6 +14,7 @@ from typing import Any
 import psutil
 import pytest
 
+from agents.decision.lifecycle import Phase
 from agents.network import messages
 from agents.network.keys import Keys
 from agents.network.name_ownership import NameKeeper
@@ -87,6 +89,29 @@ def test_watchdog_waits_for_a_whole_descent(height, down_s):
     )  # fmt: skip
     assert flying.watchdog.down_s == pytest.approx(down_s)
     assert driving.watchdog.down_s == 10.0
+
+
+@pytest.mark.parametrize(("phase", "helps"), [(Phase.RUNNING, 1), (Phase.READY, 0), (Phase.DONE, 0)])
+def test_broken_loop_on_wheels_calls_for_help(phase, helps):
+    """Neighbours followed the last pose of a robot that could not be read, until its process had ended."""
+    robot, alarms = Robot(Plan(small({"B": "khepera4"})).assignment("B")), []
+    robot.lifecycle.phase = int(phase)
+    body = Airborne("stop", steps=0)  # it is beyond reach
+    keeper, silent = NameKeeper(Keys("park"), "B", 0.0), lambda _reason: None
+    descent = Descent(
+        [robot], body, keeper, Ticks(50.0), silence_s=5.0, alarm=alarms.append, recover=silent, timing=QUICK
+    )
+    descent.session = Net().session
+
+    def breaks() -> None:
+        with ExitStack() as steps:
+            descent.register(steps)
+            raise OSError("the loop breaks")
+
+    with pytest.raises(OSError, match="stop fails"):
+        breaks()
+    assert alarms == ["its control loop broke: OSError: the loop breaks"] * helps
+    assert "land" not in body.calls
 
 
 @pytest.mark.parametrize(("broken", "steps", "lands"), [("read", 3, 4), ("stop", 0, 0)])
