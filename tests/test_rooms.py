@@ -60,10 +60,11 @@ tools.guard
 """
 # laws whose libraries take arrays: they import numpy with them, at first use
 EXTRAS = ("agents.plugins.extras.mpc", "agents.plugins.extras.policy")
-# a line of ORDER, in which none imports another
-DEVICES = "crazyflie examples external khepera4 motion_capture tello turtlebot3"
+# a line of ORDER, in which none imports another: the folders of bridges, but for one that has a line of its own
+DEVICES = ["external", *(each.parent.name for each in (ROOT / "bridges").glob("*/__init__.py"))]
+DEVICES.remove("ros2")
 FLOORS = [
-    [f"bridges.{name}" for name in DEVICES.split()] if line == "DEVICES" else line.split()
+    [f"bridges.{name}" for name in DEVICES] if line == "DEVICES" else line.split()
     for line in ORDER.strip().splitlines()
 ]
 

@@ -101,10 +101,10 @@ def test_broken_loop_on_wheels_calls_for_help(phase, helps):
     descent = Descent(
         [robot], body, keeper, Ticks(50.0), silence_s=5.0, alarm=alarms.append, recover=silent, timing=QUICK
     )
-    descent.session = Net().session
 
     def breaks() -> None:
-        with ExitStack() as steps:
+        with Net().worn() as net, ExitStack() as steps:
+            descent.session = net.session
             descent.register(steps)
             raise OSError("the loop breaks")
 
