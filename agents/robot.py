@@ -233,19 +233,20 @@ class Robot:
     def take(self, t: float, state: BodyState) -> None:
         """Take the state of the body at `t` [s]."""
         self.now.state = state
-        self.notice()
+        if self._perception is not None:
+            self.notice()
         if self._stepping is not None:
             self._stepping.scan = state.scan
         self.observe(t)
 
     def notice(self) -> None:
-        """Take what the range sensors of the body saw last, if it is there to avoid things."""
-        if self._perception is not None:
-            self._perception.notice(self.now.state.scan)
-            self._detector.notice(self.now.state.scan)
+        """Take what the range sensors of the body saw last; of a robot that avoids things."""
+        assert self._perception is not None
+        self._perception.notice(self.now.state.scan)
+        self._detector.notice(self.now.state.scan)
 
     def rare_parts(self) -> list[object]:
-        """Objects that `notice` changes."""
+        """Objects that `notice` changes; none of a robot that avoids nothing."""
         return [] if self._perception is None else [self._perception, self._detector]
 
     def observe(self, t: float) -> None:

@@ -297,7 +297,7 @@ class TwinBody(Placeable):
         It sets their range readings; returns whether there are new ones.
         """
         self.engine.advance(self._since_start(t), [motion.wobble for motion in self.engine.motions])
-        return self._sweep(t)
+        return self._sensors is not None and self._sweep(t, self._sensors)
 
     def moved_to(self, t: float) -> None:
         """The twins were advanced to `t` [s], and measured, one by one."""
@@ -317,13 +317,14 @@ class TwinBody(Placeable):
                 twin.refill()
         if self._alone.moves_obstacles:
             self._alone.move_obstacles(self._since_start(t))
-        self._sweep(t)
+        if self._sensors is not None:
+            self._sweep(t, self._sensors)
 
-    def _sweep(self, t: float) -> bool:
+    def _sweep(self, t: float, sensors: RangeSensors) -> bool:
         """Let range sensors measure; returns whether one was due."""
-        if self._sensors is None or not self._sensors.sweep(t, self.engine):
+        if not sensors.sweep(t, self.engine):
             return False
-        for state, scan in zip(self._states, self._sensors.scans, strict=True):
+        for state, scan in zip(self._states, sensors.scans, strict=True):
             state.scan = scan
         return True
 

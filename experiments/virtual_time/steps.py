@@ -95,8 +95,8 @@ class Steps:
         if twin.engine.obstacles:
             self.obstacles[t] = [tuple(each) for each in twin.engine.obstacles]
         for robot in [member.robot for member in self._members] if scanned else ():
-            parts = robot.rare_parts()
-            self._within(Rare(lambda *_, robot=robot: robot.notice(), parts, parts), 0, None)
+            if parts := robot.rare_parts():
+                self._within(Rare(lambda *_, robot=robot: robot.notice(), parts, parts), 0, None)
 
     def undo(self) -> None:
         """Take all that was called back in a stretch back, and what was read from the records for it."""
