@@ -259,8 +259,9 @@ class Runtime:
             down = all(robot.lifecycle.phase == DONE for robot in self.robots)
             if down and patience == inf:
                 patience = t + self._descent.stop_s
-            confirmed = not self._descent.airborne or t > patience  # statuses tell of a stop that is confirmed late
-            if (self._stopping is not None or self._setup.once) and (t > farewell or (down and confirmed)):
+            # statuses tell of a stop that is confirmed late, and of wheels that still roll
+            over = down and (t > patience or not (self._descent.airborne or self._telemetry.unconfirmed()))
+            if (self._stopping is not None or self._setup.once) and (t > farewell or over):
                 self._telemetry.send_statuses(t, everything=True)
                 return
 

@@ -214,6 +214,10 @@ class TelemetryPublisher:
             incidents=list(self._incidents[row]),
         )
 
+    def unconfirmed(self) -> bool:
+        """Whether a robot is not known yet to have its motors off, or its wheels stand."""
+        return any(self._phase(row) != Phase.DONE for row in range(len(self._robots)))
+
     def _phase(self, row: int) -> int:
         """Phase of a robot for others: one that was stopped lands until its body confirms that, then it is done."""
         robot = self._robots[row]

@@ -130,7 +130,7 @@ def test_robots_agree_on_an_average_in_real_time(tmp_path):
     assert trace.dropped.sum() > 0
     poses = typed(file, "/KH01/pose")
     spoken = [pose for pose in poses if hasattr(pose, "shared")]
-    assert [each.name for each in spoken[-1].shared] == ["x", "q", "n"]
+    assert [each.name for each in spoken[-1].shared] == ["n", "q", "x"]
     assert len(poses) - len(spoken) < len(spoken) / 3  # those before its first step
 
 
