@@ -145,10 +145,8 @@ def test_every_device_moves_and_stops_as_ordered(kind, preflight):
     text = ONE.replace("KIND", kind).replace("HOVER", ", hover = 0.8" if KINDS[kind].flies else "")
     (robot,) = preflight(text, "--hop", "--stop", "--bodies", "protocol", code=None)
     (moved,) = (robot[name] for name in ("hop", "drive") if name in robot)
-    stops = {name: each["found"] for name, each in robot.items() if name.startswith("stop")}
     assert moved["verdict"] == "ok"
-    assert stops
-    assert all("after " in found for found in stops.values()), stops  # later than is safe, on a busy machine
+    assert "after " in robot["stop, motors on"]["found"], robot  # later than is safe, on a busy machine
 
 
 def test_drones_hop_through_their_bridges_under_motion_capture(preflight):
