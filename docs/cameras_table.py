@@ -23,7 +23,7 @@ from twins.arrays import Array
 
 SETS = 120  # sets of images
 COLD = 20  # sets without anything known from earlier images
-STEP_S = 0.033  # from one set to the next [s]
+STEP_S = 0.033  # period of the sets of images [s]
 TIMES = 3  # repetitions, of which the quickest counts: other programs share the machine
 WHEELS = {f"KH0{k}": (k, 0.10, 0.06, True) for k in (1, 2, 3)}
 DRONES = {f"CF0{k}": (k + 3, 0.08, 0.03, False) for k in (1, 2, 3)}

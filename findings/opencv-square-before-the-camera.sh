@@ -15,6 +15,7 @@ MATRIX = np.array([[720.0, 0.0, 640.0], [0.0, 720.0, 360.0], [0.0, 0.0, 1.0]])
 HALF = 0.05
 TAG = np.array([[-HALF, HALF, 0.0], [HALF, HALF, 0.0], [HALF, -HALF, 0.0], [-HALF, -HALF, 0.0]])
 UPRIGHT = np.diag([1.0, -1.0, -1.0])  # the tag looks at the camera
+counts = {}
 for name, flags in (("IPPE_SQUARE", cv2.SOLVEPNP_IPPE_SQUARE), ("SQPNP", cv2.SOLVEPNP_SQPNP)):
     wrong = []
     for x in (-0.5, 0.0, 0.5):
@@ -26,6 +27,8 @@ for name, flags in (("IPPE_SQUARE", cv2.SOLVEPNP_IPPE_SQUARE), ("SQPNP", cv2.SOL
             degrees = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
             if not (np.linalg.norm(found.ravel() - shift) < 1e-3 and degrees < 1.0):
                 wrong.append((good, round(float(degrees), 1)))
+    counts[name] = len(wrong)
     print(f"{name}: {len(wrong)} of 9 wrong; returned, degrees: {wrong}")
+assert counts == {"IPPE_SQUARE": 9, "SQPNP": 0}, counts
 END
 "$place/venv/bin/python" "$place/seen.py"

@@ -32,7 +32,7 @@ class CourseError(ExplainedError, ValueError):
 
 @dataclass(frozen=True)
 class Exercise:
-    """One exercise: an experiment file with blanks, and with criteria that judge how they are filled in.
+    """Exercise: an experiment file with blanks, and with criteria that judge how they are filled in.
 
     Attributes:
         name: Of the file, without its suffix.

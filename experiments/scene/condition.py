@@ -91,7 +91,7 @@ def condition(
 
 @dataclass(frozen=True)
 class RobotRow:
-    """One robot in a table; None where nothing is known."""
+    """Robot in a table; None where nothing is known."""
 
     name: str
     condition: Condition

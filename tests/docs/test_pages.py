@@ -150,7 +150,7 @@ def test_what_a_page_refers_to_exists(page):
     assert not sorted(lost)
 
 
-NAMED = {"not-random", "device", "drives-apart", "centralised", "hybrid"}  # by a name in place of a literal
+NAMED = {"not-random", "device", "drives-apart", "centralised", "hybrid"}  # codes that stand in constants
 
 
 def codes_of_findings():

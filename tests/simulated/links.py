@@ -210,7 +210,7 @@ class Link:
             to.process.call(call, *args)
 
     def _receive(self, to: Node, call: Callable[..., object], args: tuple[Any, ...]) -> None:
-        """What has arrived for a process that was suspended, and goes on."""
+        """Deliver samples that arrived while a process was suspended, as it goes on."""
         if self._open[to]:
             call(*args)
 

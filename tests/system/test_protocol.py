@@ -117,24 +117,16 @@ def test_ctrl_c_lands_the_robot_that_hops(preflight, tmp_path):
     assert log.read_text().rstrip().splitlines()[-1].startswith("CF01: done")
 
 
-DRONES = """
-title = "A Crazyflie by radio and a Tello, under motion capture"
+BUSY = """
+title = "Robots behind their protocols"
 duration_s = 30.0
 start = { deadline_s = 40.0 }
-safety = { position_timeout_s = 4.0, land_without_position_s = 4.0 }  # a busy machine holds up the radio
+safety = { position_timeout_s = 4.0, land_without_position_s = 4.0 }  # a busy machine holds up radio and network
 [robots]
+"""
+DRONES = """
 CF01 = { kind = "crazyflie", start = [0.0, -0.6, 0.0], hover = 0.5 }
 T01 = { kind = "tello", start = [0.0, 0.6, 0.0], hover = 0.8 }
-"""
-
-
-ONE = """
-title = "A robot behind its protocol"
-duration_s = 30.0
-start = { deadline_s = 40.0 }
-safety = { position_timeout_s = 4.0, land_without_position_s = 4.0 }  # a busy machine holds up the network
-[robots]
-R = { kind = "KIND", start = [0.0, 0.0] HOVER }
 """
 DEVICES = sorted(name.removesuffix("-twin") for name in registry.names(registry.DEVICES))
 
@@ -142,15 +134,16 @@ DEVICES = sorted(name.removesuffix("-twin") for name in registry.names(registry.
 @pytest.mark.parametrize("kind", DEVICES)
 def test_every_device_moves_and_stops_as_ordered(kind, preflight):
     """Of yours too: a turn to the wrong side, or a stop that its firmware doesn't know, is found here."""
-    text = ONE.replace("KIND", kind).replace("HOVER", ", hover = 0.8" if KINDS[kind].flies else "")
-    (robot,) = preflight(text, "--hop", "--stop", "--bodies", "protocol", code=None)
+    hover = ", hover = 0.8" if KINDS[kind].flies else ""
+    text = f'R = {{ kind = "{kind}", start = [0.0, 0.0]{hover} }}'
+    (robot,) = preflight(BUSY + text, "--hop", "--stop", "--bodies", "protocol", code=None)
     (moved,) = (robot[name] for name in ("hop", "drive") if name in robot)
     assert moved["verdict"] == "ok"
     assert "after " in robot["stop, motors on"]["found"], robot  # later than is safe, on a busy machine
 
 
 def test_drones_hop_through_their_bridges_under_motion_capture(preflight):
-    drone, tello = preflight(DRONES, "--hop", "--bodies", "protocol")
+    drone, tello = preflight(BUSY + DRONES, "--hop", "--bodies", "protocol")
     assert {drone[name]["verdict"] for name in ("address", "firmware", "battery", "position", "radio", "hop")} == {"ok"}
     assert " V under load" in drone["hop"]["found"]
     assert " ms late" in drone["hop"]["found"]

@@ -60,7 +60,7 @@ def flown(seen, images=14, cameras="ABCD", room=None):
     for k in range(images):
         true = poses_at(k, seen.bodies, rng)
         frames = [tracker.see(camera, 0.1 * k, through_jpeg(room.image(camera, true))) for camera in cameras]
-        if k == 0:  # of the first camera alone: nothing is known of others
+        if k == 0:  # poses of the first camera alone: the others have seen nothing yet
             continue
         assert frames[-1][0] == pytest.approx(0.1 * k)
         for name, pose in frames[-1][1].items():
@@ -346,7 +346,7 @@ def board(camera, k, rng):
     """The board before a camera, each time elsewhere in its image."""
     outline = np.array([[-4.0, 3.0, 0.0], [4.0, 3.0, 0.0], [4.0, -3.0, 0.0], [-4.0, -3.0, 0.0]]) * 0.045
     far = 0.55 + 0.25 * rng.random()
-    centre = np.array([0.52 * far * ((k % 3) - 1), 0.27 * far * ((k // 3 % 3) - 1), far])  # as the camera sees it
+    centre = np.array([0.52 * far * ((k % 3) - 1), 0.27 * far * ((k // 3 % 3) - 1), far])  # coordinates of the camera
     turn = cv2.Rodrigues(rng.uniform(-0.5, 0.5, 3))[0] @ np.diag([1.0, -1.0, -1.0])
     return Sheet(BOARD.generateImage((800, 600)), (centre + outline @ turn.T) @ camera.rotation + camera.place)
 

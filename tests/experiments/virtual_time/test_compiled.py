@@ -232,7 +232,7 @@ def turned(self, neighbours, position, velocity, yaw, target, speed, leads):  # 
     ("owner", "name", "other"), [(Stepping, "step", faster), (Speech, "update", hoarse), (Stepping, "view", turned)]
 )
 def test_compiled_steps_are_those_of_the_process(monkeypatch, owner, name, other):
-    """One source: what is changed there changes compiled ticks and plain ones alike."""
+    """A changed decision changes compiled ticks and plain ones alike: it has one source."""
     monkeypatch.setattr(stretch, "DRIVERS", {})
     monkeypatch.setattr(stretch, "RECENT", {})
     made = remembering(plugin(LAWS, "leader-observer"))

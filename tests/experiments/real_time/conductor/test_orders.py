@@ -160,7 +160,7 @@ DEAF = Unreachable("no router answers")
 
 
 @pytest.mark.parametrize(
-    ("report", "seen", "result"),  # of the process of the run; at its router; down, moving, strangers
+    ("report", "seen", "result"),  # robots: reported by the run; seen at its router; down, moving, strangers
     [
         (StopReport(["A", "B"], ["A", "B"]), "AB", ("AB", "", "")),
         (StopReport(["A", "B"], ["A", "B"]), DEAF, ("AB", "", "")),
@@ -169,7 +169,7 @@ DEAF = Unreachable("no router answers")
         (None, "CD", ("", "AB", "CD")),  # likewise, and its process stands still
         (None, "AB", ("AB", "", "")),
         (None, DEAF, ("", "AB", "")),
-        (StopReport([], []), "", ("", "", "")),  # between two cases
+        (StopReport([], []), "", ("", "", "")),  # no case is up
     ],
 )
 def test_stopped_are_robots_of_that_run(report, seen, result, stopped):
