@@ -11,6 +11,8 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -116,7 +118,7 @@ def serve_router(
         with closing_cleanly(_routing(chosen, endpoints, patience_s, stop)) as (session, declared):
             guard = None
             if register is not None and rights is not None:
-                guard = Guard(session, lab.register(register.parent), rights)
+                guard = Guard(session, partial(lab.register, register.parent), rights)
                 declared.append(guard)
             ready(session)
             patience_s = PORT_FREE_S
@@ -150,8 +152,10 @@ class Guard:
     admin space made it stand still for good.
     """
 
-    def __init__(self, session: zenoh.Session, known: lab.Register, rights: Rights) -> None:
-        self._session, self._known, self._rights = session, known, rights
+    def __init__(self, session: zenoh.Session, read: Callable[[], lab.Register], rights: Rights) -> None:
+        """`read` returns the register of the lab as it is now; it raises LabError, here too."""
+        self._session, self._read, self._rights = session, read, rights
+        self._known = read()
         self._keys = Keys(rights.realm)
         self._told: set[str] = set()
         self._clock = Clock()
@@ -178,10 +182,18 @@ class Guard:
             same[:] = [each for each in same if (each.zid, each.dst) != (link.zid, link.dst)]
             return
         same.append(link)
-        if (victim := lab.robbed(self._known, str(link.zid), link.auth_identifier)) is not None:
+        if (victim := self._robbed(link)) is not None:
             self._disconnect(link, f"came with the id of {victim}")
         elif len(same) > MOST_SESSIONS and not self._trusted(link):
             self._disconnect(link, f"is one of more than {MOST_SESSIONS}")
+
+    def _robbed(self, link: zenoh.Link) -> str | None:
+        """Identity whose id a session took, by the register as it is now: a certificate may come before its rules."""
+        victim = lab.robbed(self._known, str(link.zid), link.auth_identifier)
+        if victim is not None:
+            with suppress(lab.LabError):
+                return lab.robbed(self._read(), str(link.zid), link.auth_identifier)
+        return victim
 
     def _check_token(self, sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)

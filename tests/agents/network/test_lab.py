@@ -332,8 +332,21 @@ def guarded(monkeypatch):
     own = {name: Grant(tokens=KEYS.owner_tokens(KEYS.alive(name))) for name in ("CF01", "KH01")}
     events, hung_up = Events(), []
     monkeypatch.setattr(routing_process, "hang_up_on", lambda link: hung_up.append(link) or True)
-    guard = Guard(events, lab.Register(identities), Rights("park", own, {}))
-    return SimpleNamespace(guard=guard, link=events.link, token=events.token, hung_up=hung_up)
+    guard = Guard(events, lambda: lab.Register(dict(identities)), Rights("park", own, {}))
+    return SimpleNamespace(guard=guard, link=events.link, token=events.token, hung_up=hung_up, identities=identities)
+
+
+def test_a_new_certificate_may_come_before_its_rules(guarded):
+    """A robot that was disconnected whenever it came, 200 times a second, was not connected again afterwards."""
+    zid = lab.session_id("CF01")
+    guarded.link(Link(zid, "CF01.2"))
+    assert [link.auth_identifier for link in guarded.hung_up] == ["CF01.2"]
+    guarded.hung_up.clear()
+    guarded.identities["CF01"] = lab.Identity("robot", "CF01.2", "1", "2100")
+    guarded.link(Link(zid, "CF01.2"))
+    assert not guarded.hung_up
+    guarded.link(Link(zid, "KH01"))
+    assert [link.auth_identifier for link in guarded.hung_up] == ["KH01"]
 
 
 def test_certificate_has_a_few_sessions(guarded):
