@@ -1,4 +1,4 @@
-"""Small experiments built in Python, and the reference experiment."""
+"""Small experiments built in Python, a law in text, and the reference experiment."""
 
 from collections.abc import Mapping
 from functools import cache
@@ -17,6 +17,31 @@ NOISY = {
     "KH03": Disturbance(latency_s=0.05, odometry_drift=0.002),
     "CF02": Disturbance(latency_s=0.02),
 }
+COUNTING_LAW = '''
+from math import nan
+
+from zenpark import Control, Law, Measure
+
+
+class Counting(Law, frozen=True):
+    """The law `displacement`, which also counts its steps."""
+
+    NEEDS = "relative"
+    MEASURES = {"push": Measure("m")}
+
+    stiffness: float = 0.3
+
+    def begin(self, robot):
+        return {"steps": (0.0,)}
+
+    def step(self, view, memory):
+        x = y = 0.0
+        for each in view.neighbours:
+            x += self.stiffness * (each.link.relative[0] - view.position[0] + each.position[0])
+            y += self.stiffness * (each.link.relative[1] - view.position[1] + each.position[1])
+        goal, steps = (view.position[0] + x, view.position[1] + y, nan), memory["steps"][0]
+        return Control(memory={"steps": (steps + 1.0,)}, goal=goal, measures={"push": (x * x + y * y) ** 0.5})
+'''
 
 
 def changed(experiment: Experiment, **parts: object) -> Experiment:

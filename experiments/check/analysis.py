@@ -109,6 +109,11 @@ class Analysis:
         return np.array([held_height(self.plan.experiment, name) for name in self.plan.names])
 
     @cached_property
+    def radius(self) -> Array:
+        """(N,) of the robots [m]."""
+        return np.array([kind.radius for kind in self.plan.kinds])
+
+    @cached_property
     def limits(self) -> Limits:
         """Limits of every robot, except `hold_s`."""
         return self.plan.limits(self.plan.names[0])
@@ -296,6 +301,16 @@ class Analysis:
         """Number in the timeline, robot and planner of each leg."""
         built = {name: iter(legs) for name, legs in self.plan.legs_by_robot.items()}
         return [(k, leg.robot, next(built[leg.robot]).planner) for k, leg in enumerate(self.plan.experiment.timeline)]
+
+    def sources(self, time: float, *robots: str) -> str:
+        """Places in files that robots follow at a time [s], in brackets; empty if they follow none."""
+        timeline = self.plan.experiment.timeline
+        found = []
+        for name in robots:
+            begun = [(timeline[k].at_s, plan) for k, robot, plan in self.legs if robot == name]
+            source = next((plan.source(time - at) for at, plan in reversed(begun) if at <= time), "")
+            found += [source] if source else []
+        return f" ({'; '.join(found)})" if found else ""
 
     @property
     def fastest(self) -> tuple[int, str, Planner] | None:

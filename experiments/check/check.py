@@ -10,8 +10,7 @@ import numpy as np
 
 from agents.plugins.calls import supervised
 from agents.plugins.files import plain
-from experiments.check import motion, noise, safety, theory
-from experiments.check import obstacles as surroundings
+from experiments.check import motion, noise, safety, surroundings, theory
 from experiments.check.analysis import Analysis
 from experiments.check.findings import FORGIVEN, MARK, NOT_RANDOM, CheckNumbers, Finding, first_of_each_code
 from experiments.check.ideal_run import isolated, predict, ticking_plugins, uncompiled
@@ -51,7 +50,8 @@ SUBJECTS: Final = (
     theory.network, theory.presence, theory.lengths, theory.realisation, theory.rigidity,
     theory.redundancy, theory.stability, theory.law,
     surroundings.contacts, surroundings.obstacles, surroundings.perception, surroundings.reality,
-    motion.flight, motion.starts, motion.formation, motion.anchors, noise.softness, motion.walls, motion.ceiling,
+    motion.flight, motion.starts, motion.formation, motion.anchors, noise.softness,
+    surroundings.walls, surroundings.ceiling,
     motion.encounters, motion.speeds, motion.recordings, motion.turning_circle, motion.rates, motion.ends,
     safety.architecture, safety.safety, safety.batteries, safety.libraries, safety.devices,
     safety.turned,

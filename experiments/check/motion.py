@@ -1,4 +1,4 @@
-"""Checks of the predicted motion: acquisition, arena, walls, collisions, speeds and rates."""
+"""Checks of the predicted motion: starts, acquisition, collisions, speeds and rates."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from agents.plugins.planners import Planner
 from agents.safety.hazards import Cause
 from experiments.check import noise
 from experiments.check.analysis import Analysis
-from experiments.check.findings import APART, FORGIVEN, Finding, join_names
+from experiments.check.findings import FORGIVEN, Finding, join_names
 from experiments.check.ideal_run import approaches
 from experiments.check.realisation import OFF, mirrored_robots
 from experiments.check.theory import strength
@@ -37,7 +37,6 @@ ACCELERATES_S: Final = 0.2  # [s] window of a mean acceleration
 BEGINS_M: Final = 0.15  # [m] distance of a robot from the begin of its recording: less than a goal may be away
 GRAVITY: Final = 9.81  # [m/s²]
 TILT: Final = math.radians(20.0)  # [rad] limit of tilt in the position controllers of small drones
-SPREADS: Final = 1.3  # growth of the distances between robots from which on a law drives them apart
 SETTLED: Final = 1e-3  # [m] travel per decision below which robots are at rest, and in `WINDOW_S` one on wheels stands
 
 
@@ -45,7 +44,7 @@ def starts(analysis: Analysis) -> Iterator[Finding]:
     """Check that robots start inside the arena and clear of one another; flying ones too start on the floor."""
     names, limits = analysis.plan.names, analysis.limits
     start = analysis.start[:, :2]
-    inside = np.minimum(start - limits.low[:2], np.array(limits.high[:2]) - start).min(axis=1) - _radii(analysis)
+    inside = np.minimum(start - limits.low[:2], np.array(limits.high[:2]) - start).min(axis=1) - analysis.radius
     problems = []
     for row in np.flatnonzero(inside < limits.margin - FORGIVEN):
         wall = f"{inside[row]:.2f} m from a wall" if inside[row] >= 0.0 else "in a wall"
@@ -66,14 +65,9 @@ def starts(analysis: Analysis) -> Iterator[Finding]:
 
 def _overlap_at_start(analysis: Analysis) -> Mask:
     """(N, N) whether two robots are too near to stand side by side at the start."""
-    start, radius = analysis.start, _radii(analysis)
+    start, radius = analysis.start, analysis.radius
     near: Mask = norm(start[:, None] - start) < radius[:, None] + radius - FORGIVEN
     return near & ~np.eye(len(start), dtype=bool)
-
-
-def _radii(analysis: Analysis) -> Array:
-    """(N,) [m]."""
-    return np.array([kind.radius for kind in analysis.plan.kinds])
 
 
 def flight(analysis: Analysis) -> Iterator[Finding]:
@@ -294,29 +288,6 @@ def _standing_wheels(analysis: Analysis, at: int) -> Index:
     )
 
 
-def walls(analysis: Analysis) -> Iterator[Finding]:
-    """Check that no robot leaves the arena, or is held back by the margin at a wall."""
-    names, limits = analysis.plan.names, analysis.limits
-    track = analysis.prediction.position
-    beyond = np.maximum(track - limits.high, limits.low - track)  # (T, N, 3), positive outside
-    outside = beyond.max(axis=2) > FORGIVEN
-    beside = beyond[..., :2].max(axis=2) + _radii(analysis)  # (T, N), surfaces
-    if apart := _driven_apart(analysis, outside):
-        yield apart
-        return
-    tight = beside > FORGIVEN - limits.margin
-    tight &= ~tight[0]  # a start there is a finding of `starts`
-    problems = [_left_arena(analysis, int(row), outside[:, row]) for row in np.flatnonzero(outside.any(axis=0))]
-    for row in np.flatnonzero(tight.any(axis=0) & ~outside.any(axis=0)):
-        _, when = _first_time(analysis, int(row), tight[:, row])
-        message = f"{names[row]} comes within the margin of {limits.margin:g} m of a wall {when}"
-        remedy = "it will be held back there: enlarge size in [arena], or lead the formation away from the wall"
-        problems.append(Finding("warning", "near-wall", message, remedy, ("arena", "size")))
-    yield from problems
-    if not problems:
-        yield Finding("note", "inside", "the expected paths stay inside the arena")
-
-
 def encounters(analysis: Analysis) -> Iterator[Finding]:
     """Check that no robots collide or land on each other; pairs too near at the start are not repeated."""
     names, kinds, experiment = analysis.plan.names, analysis.plan.kinds, analysis.plan.experiment
@@ -335,14 +306,14 @@ def encounters(analysis: Analysis) -> Iterator[Finding]:
                 "give robots other ways or places from here on, or add an avoidance (`./zenpark explain avoidance`)"
             )
         message = f"{first} and {second} come within {each.distance:.2f} m at {each.time:.1f} s; {how}"
-        message += _sources(analysis, each.time, first, second)
+        message += analysis.sources(each.time, first, second)
         if experiment.avoidance is None or not (experiment.robots[first].avoids or experiment.robots[second].avoids):
             yield Finding("warning", "too-close", message, remedy, path)
         else:
             yield Finding("note", "avoidance-acts", f"{message}: avoidance will have to act", "", path)
     if _cut(analysis) or analysis.prediction.stuck:
         return
-    final, radius = analysis.prediction.position[-1], _radii(analysis)
+    final, radius = analysis.prediction.position[-1], analysis.radius
     heard = adjacency(analysis.plan.links, len(names)) > 0
     for row in np.flatnonzero([kind.flies for kind in kinds]):
         below = (final[:, 2] < final[row, 2] - FORGIVEN) & (norm(final[:, :2] - final[row, :2]) < radius + radius[row])
@@ -361,74 +332,6 @@ def _manoeuvres(plan: Plan) -> list[tuple[float, Path]]:
     legs: list[tuple[float, Path]] = [(each.at_s, ("timeline", k)) for k, each in enumerate(plan.experiment.timeline)]
     changes = enumerate(plan.experiment.formation.changes)
     return [*legs, *((each.at_s, ("formation", "changes", k)) for k, each in changes)]
-
-
-def ceiling(analysis: Analysis) -> Iterator[Finding]:
-    """Check that the overshoot of a take-off stays below the top of the arena."""
-    top = analysis.plan.experiment.arena.size[2]
-    for name, kind, hover in zip(analysis.plan.names, analysis.plan.kinds, analysis.height.tolist(), strict=True):
-        highest = (1.0 + kind.overshoot) * hover
-        if kind.overshoot and highest > top + FORGIVEN:
-            how = f"the take-off of a {kind.name} overshoots by up to {kind.overshoot:.0%}"
-            message = f"{name} hovers at {hover:g} m, and {how}: to {highest:.2f} m, in an arena {top:g} m high"
-            lower = math.floor(100.0 * top / (1.0 + kind.overshoot)) / 100.0
-            remedy = f"hover at {lower:g} m at most, or enlarge size in [arena] if the room is higher"
-            yield Finding("warning", "overshoots-arena", message, remedy, ("robots", name, "hover"))
-
-
-def _first_time(analysis: Analysis, row: int, where: Mask) -> tuple[float, str]:
-    """Time at which a row is first there, and when and where that is in words."""
-    at = int(where.argmax())
-    time, (x, y, _) = float(analysis.prediction.time[at]), analysis.prediction.position[at, row]
-    return time, f"at {time:.1f} s, at ({x:.2f}, {y:.2f})"
-
-
-def _sources(analysis: Analysis, time: float, *robots: str) -> str:
-    """Places in files that robots follow at a time, in brackets; empty if they follow none."""
-    timeline = analysis.plan.experiment.timeline
-    found = []
-    for name in robots:
-        begun = [(timeline[k].at_s, plan) for k, robot, plan in analysis.legs if robot == name]
-        source = next((plan.source(time - at) for at, plan in reversed(begun) if at <= time), "")
-        found += [source] if source else []
-    return f" ({'; '.join(found)})" if found else ""
-
-
-def _driven_apart(analysis: Analysis, outside: Mask) -> Finding | None:
-    """Error of a law by which most robots leave the arena (T, N), farther from each other than they began."""
-    follow = analysis.placed
-    count = int(follow.sum())
-    if count < 2 or 2 * int(outside[:, follow].any(axis=0).sum()) <= count:
-        return None
-    first = int(outside[:, follow].any(axis=1).argmax())
-    place = analysis.prediction.position[[0, first]][:, follow]
-    begun, ended = norm(place[:, :, None] - place[:, None]).sum(axis=(1, 2)) / (count * (count - 1))
-    errors = analysis.error[[0, first]].mean(axis=1) if analysis.has_targets else np.array([0.0, 1.0])
-    if ended < SPREADS * begun or errors[1] <= errors[0]:
-        return None
-    row = int(np.flatnonzero(follow)[outside[first, follow].argmax()])
-    _, when = _first_time(analysis, row, outside[:, row])
-    return Finding(
-        "error",
-        APART,
-        f"the law drives the robots apart: on average {begun:.2f} m from each other at first, {ended:.2f} m when the "
-        f"first, {analysis.plan.names[row]}, would leave the arena {when}",
-        "is a sign turned round? A robot goes towards a neighbour along each.position - view.position",
-        ("formation", "law"),
-    )
-
-
-def _left_arena(analysis: Analysis, row: int, outside: Mask) -> Finding:
-    name, timeline = analysis.plan.names[row], analysis.plan.experiment.timeline
-    time, when = _first_time(analysis, row, outside)
-    begun = [k for k, robot, _ in analysis.legs if robot == name and timeline[k].at_s <= time]
-    message = f"{name} would leave the arena {when}"
-    if row in analysis.without_neighbours and begun:
-        remedy = "shorten the plan, start it elsewhere, or enlarge size in [arena]"
-        message = f"{message}, by its plan{_sources(analysis, time, name)}"
-        return Finding("error", "leaves-arena", message, remedy, ("timeline", begun[-1], "plan"))
-    remedy = "start the formation farther inside, lead it elsewhere, or enlarge size in [arena]"
-    return Finding("error", "leaves-arena", message, remedy, ("robots", name, "start"))
 
 
 def speeds(analysis: Analysis) -> Iterator[Finding]:

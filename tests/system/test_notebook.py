@@ -8,39 +8,19 @@ import pytest
 from experiments.file.problems import DocumentError
 from experiments.run import fly, reopen
 from tests.commands import python
+from tests.small import COUNTING_LAW
 from zenpark import load
 
-NOTEBOOK = '''
-from math import nan
+NOTEBOOK = f"""
+from zenpark import fly, load, simulate
 
-from zenpark import Control, Law, Measure, fly, load, simulate
-
-GAIN = 0.3
-
-
-class Offsets(Law, frozen=True):
-    """The law `displacement`, which also counts its steps."""
-
-    NEEDS = "relative"
-    MEASURES = {"push": Measure("m")}
-    stiffness: float = 0.1
-
-    def begin(self, robot):
-        return {"steps": (0.0,)}
-
-    def step(self, view, memory):
-        x = y = 0.0
-        for each in view.neighbours:
-            x += self.stiffness * (each.link.relative[0] - view.position[0] + each.position[0])
-            y += self.stiffness * (each.link.relative[1] - view.position[1] + each.position[1])
-        goal, steps = (view.position[0] + x, view.position[1] + y, nan), memory["steps"][0]
-        return Control(memory={"steps": (steps + 1.0,)}, goal=goal, measures={"push": (x * x + y * y) ** 0.5})
-
+GAIN = 0.25
+{COUNTING_LAW}
 
 if __name__ == "__main__":
-    read = load("two.toml", law=Offsets(stiffness=GAIN))
+    read = load("two.toml", law=Counting(stiffness=GAIN))
     print(simulate(read).metrics["default"].mean["rmse"], fly(read, folder="flown").metrics["default"].mean["rmse"])
-'''
+"""
 FILE = """
 title = "One keeps an offset"
 duration_s = 5.0
@@ -56,18 +36,18 @@ def test_law_of_a_notebook_flies_in_real_time(tmp_path):
     (tmp_path / "two.toml").write_text(FILE, "utf-8")
     (tmp_path / "notebook.py").write_text(NOTEBOOK, "utf-8")
     said = python("notebook.py", cwd=tmp_path).stdout
-    kept = tmp_path / "flown" / "offsets.py"
-    assert said.startswith(f"{Path('flown', 'offsets.py')}: ")
-    assert "class Offsets(Law, frozen=True):" in kept.read_text("utf-8")
+    kept = tmp_path / "flown" / "counting.py"
+    assert said.startswith(f"{Path('flown', 'counting.py')}: ")
+    assert "class Counting(Law, frozen=True):" in kept.read_text("utf-8")
     simulated, flown = map(float, said.split()[-2:])
     assert flown == pytest.approx(simulated, rel=0.1)
     again = reopen(tmp_path / "flown").metrics["default"]
     assert (again.clock, again.mean["rmse"], again.failures) == ("real", flown, ())
     assert again.measures["push"].unit == "m"
     origin = json.loads((tmp_path / "flown" / "run.json").read_text("utf-8"))
-    assert origin["changes"] == ['formation.law={"kind" = "offsets.py:Offsets", "stiffness" = 0.3}']
+    assert origin["changes"] == ['formation.law={"kind" = "counting.py:Counting", "stiffness" = 0.25}']
     repeated = load(tmp_path / "flown" / "experiment.toml", *origin["changes"])
-    assert repeated.experiment.formation.law["stiffness"] == 0.3
+    assert repeated.experiment.formation.law["stiffness"] == 0.25
 
 
 def test_real_robots_are_not_for_a_notebook(tmp_path):

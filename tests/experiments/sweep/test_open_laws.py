@@ -19,30 +19,8 @@ from experiments.sweep import page, table
 from experiments.sweep.optimise import parse_objective
 from experiments.sweep.sweep import sweep
 from tests.commands import invoke
+from tests.small import COUNTING_LAW
 
-LAW = '''
-from zenpark import Control, Law, Measure
-
-
-class Own(Law, frozen=True):
-    """The law `displacement`, which also counts its steps."""
-
-    NEEDS = "relative"
-    MEASURES = {"push": Measure("m")}
-
-    stiffness: float = 0.3
-
-    def begin(self, robot):
-        return {"steps": (0.0,)}
-
-    def step(self, view, memory):
-        x = y = 0.0
-        for each in view.neighbours:
-            x += self.stiffness * (each.link.relative[0] - view.position[0] + each.position[0])
-            y += self.stiffness * (each.link.relative[1] - view.position[1] + each.position[1])
-        goal, steps = (view.position[0] + x, view.position[1] + y, float("nan")), memory["steps"][0]
-        return Control(memory={"steps": (steps + 1.0,)}, goal=goal, measures={"push": (x * x + y * y) ** 0.5})
-'''
 METRIC = '''
 import numpy as np
 from zenpark import Metric
@@ -70,13 +48,13 @@ cases.periodic.trigger = { kind = "periodic", period_s = 0.1 }
 cases.event.trigger = { kind = "send-on-delta", threshold = 0.01 }
 criteria = [{ metric = "place.py:Place", at_most = 2.0 }]
 """
-OWN = 'formation.law="own.py:Own"'
+OWN = 'formation.law="own.py:Counting"'
 
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory):
     folder = tmp_path_factory.mktemp("open")
-    for name, text in (("own.py", LAW), ("place.py", METRIC), ("three.toml", FILE)):
+    for name, text in (("own.py", COUNTING_LAW), ("place.py", METRIC), ("three.toml", FILE)):
         (folder / name).write_text(text, "utf-8")
     return folder / "three.toml"
 
@@ -174,7 +152,9 @@ def test_links_have_colours_or_are_grey(file):
     plan = load(file, OWN).cases()["event"]
     place = np.array([[0.0, 0.0, 0.0], [-0.4, 0.4, 0.0], [-0.4, -0.3, 0.0]])
     assert LinkTracker(SceneModel.of_plan(plan)).errors(1.0, place) == pytest.approx([0.1, 0.0])
-    bare = load(file, OWN.replace("own.py:Own", "cyclic-pursuit"), 'formation.links={"A > B" = "link", "A > C" = 0.5}')
+    bare = load(
+        file, OWN.replace("own.py:Counting", "cyclic-pursuit"), 'formation.links={"A > B" = "link", "A > C" = 0.5}'
+    )
     scene = SceneModel.of_plan(bare.cases()["event"])
     assert LinkTracker(scene).errors(1.0, place) == pytest.approx([BARE, 0.0])
 

@@ -1,22 +1,104 @@
-"""Checks of obstacles: collisions on the predicted paths, contacts, sensors, and worlds."""
+"""Checks of the surroundings of the predicted paths: arena, obstacles, contacts, sensors, and worlds."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
 
 from experiments.check.analysis import Analysis
-from experiments.check.findings import FORGIVEN, Finding, join_names
+from experiments.check.findings import APART, FORGIVEN, Finding, join_names
 from experiments.definition.bodies import sensors_of
 from experiments.definition.experiment import WORLD
 from twins import scene as outlines
-from twins.arrays import Array, Index, Mask
+from twins.arrays import Array, Index, Mask, norm
 from twins.scene import Obstacle
 
 TWINS: Final = ("twin", WORLD)  # bodies that are simulated without the wire of a real one
+SPREADS: Final = 1.3  # growth of the distances between robots from which on a law drives them apart
 AVOID: Final = 'or let robots avoid it: [avoidance] with kind = "barrier"'
+
+
+def walls(analysis: Analysis) -> Iterator[Finding]:
+    """Check that no robot leaves the arena, or is held back by the margin at a wall."""
+    names, limits = analysis.plan.names, analysis.limits
+    track = analysis.prediction.position
+    beyond = np.maximum(track - limits.high, limits.low - track)  # (T, N, 3), positive outside
+    outside = beyond.max(axis=2) > FORGIVEN
+    beside = beyond[..., :2].max(axis=2) + analysis.radius  # (T, N), surfaces
+    if apart := _driven_apart(analysis, outside):
+        yield apart
+        return
+    tight = beside > FORGIVEN - limits.margin
+    tight &= ~tight[0]  # a start there is a finding of `starts`
+    problems = [_left_arena(analysis, int(row), outside[:, row]) for row in np.flatnonzero(outside.any(axis=0))]
+    for row in np.flatnonzero(tight.any(axis=0) & ~outside.any(axis=0)):
+        _, when = _first_time(analysis, int(row), tight[:, row])
+        message = f"{names[row]} comes within the margin of {limits.margin:g} m of a wall {when}"
+        remedy = "it will be held back there: enlarge size in [arena], or lead the formation away from the wall"
+        problems.append(Finding("warning", "near-wall", message, remedy, ("arena", "size")))
+    yield from problems
+    if not problems:
+        yield Finding("note", "inside", "the expected paths stay inside the arena")
+
+
+def _driven_apart(analysis: Analysis, outside: Mask) -> Finding | None:
+    """Error of a law by which most robots leave the arena (T, N), farther from each other than they began."""
+    follow = analysis.placed
+    count = int(follow.sum())
+    if count < 2 or 2 * int(outside[:, follow].any(axis=0).sum()) <= count:
+        return None
+    first = int(outside[:, follow].any(axis=1).argmax())
+    place = analysis.prediction.position[[0, first]][:, follow]
+    begun, ended = norm(place[:, :, None] - place[:, None]).sum(axis=(1, 2)) / (count * (count - 1))
+    errors = analysis.error[[0, first]].mean(axis=1) if analysis.has_targets else np.array([0.0, 1.0])
+    if ended < SPREADS * begun or errors[1] <= errors[0]:
+        return None
+    row = int(np.flatnonzero(follow)[outside[first, follow].argmax()])
+    _, when = _first_time(analysis, row, outside[:, row])
+    return Finding(
+        "error",
+        APART,
+        f"the law drives the robots apart: on average {begun:.2f} m from each other at first, {ended:.2f} m when the "
+        f"first, {analysis.plan.names[row]}, would leave the arena {when}",
+        "is a sign turned round? A robot goes towards a neighbour along each.position - view.position",
+        ("formation", "law"),
+    )
+
+
+def _left_arena(analysis: Analysis, row: int, outside: Mask) -> Finding:
+    name, timeline = analysis.plan.names[row], analysis.plan.experiment.timeline
+    time, when = _first_time(analysis, row, outside)
+    begun = [k for k, robot, _ in analysis.legs if robot == name and timeline[k].at_s <= time]
+    message = f"{name} would leave the arena {when}"
+    if row in analysis.without_neighbours and begun:
+        remedy = "shorten the plan, start it elsewhere, or enlarge size in [arena]"
+        message = f"{message}, by its plan{analysis.sources(time, name)}"
+        return Finding("error", "leaves-arena", message, remedy, ("timeline", begun[-1], "plan"))
+    remedy = "start the formation farther inside, lead it elsewhere, or enlarge size in [arena]"
+    return Finding("error", "leaves-arena", message, remedy, ("robots", name, "start"))
+
+
+def _first_time(analysis: Analysis, row: int, where: Mask) -> tuple[float, str]:
+    """Time at which a row is first there, and when and where that is in words."""
+    at = int(where.argmax())
+    time, (x, y, _) = float(analysis.prediction.time[at]), analysis.prediction.position[at, row]
+    return time, f"at {time:.1f} s, at ({x:.2f}, {y:.2f})"
+
+
+def ceiling(analysis: Analysis) -> Iterator[Finding]:
+    """Check that the overshoot of a take-off stays below the top of the arena."""
+    top = analysis.plan.experiment.arena.size[2]
+    for name, kind, hover in zip(analysis.plan.names, analysis.plan.kinds, analysis.height.tolist(), strict=True):
+        highest = (1.0 + kind.overshoot) * hover
+        if kind.overshoot and highest > top + FORGIVEN:
+            how = f"the take-off of a {kind.name} overshoots by up to {kind.overshoot:.0%}"
+            message = f"{name} hovers at {hover:g} m, and {how}: to {highest:.2f} m, in an arena {top:g} m high"
+            lower = math.floor(100.0 * top / (1.0 + kind.overshoot)) / 100.0
+            remedy = f"hover at {lower:g} m at most, or enlarge size in [arena] if the room is higher"
+            yield Finding("warning", "overshoots-arena", message, remedy, ("robots", name, "hover"))
 
 
 def describe_obstacle(obstacle: Obstacle) -> str:
@@ -34,7 +116,7 @@ def obstacles(analysis: Analysis) -> Iterator[Finding]:
     scene, prediction = analysis.plan.scene, analysis.prediction
     if not scene.names:
         return
-    radius = np.array([kind.radius for kind in analysis.plan.kinds])
+    radius = analysis.radius
     low, high = _heights(analysis, prediction.position[..., 2])
     poses = scene.along(prediction.time)
     robots = analysis.plan.experiment.robots.values()
