@@ -188,7 +188,7 @@ class Guard:
             self._disconnect(link, f"is one of more than {MOST_SESSIONS}")
 
     def _robbed(self, link: zenoh.Link) -> str | None:
-        """Identity whose id a session took, by the register as it is now: a certificate may come before its rules."""
+        """Identity that lost its id to a session, by the current register: a certificate may come before its rules."""
         victim = lab.robbed(self._known, str(link.zid), link.auth_identifier)
         if victim is not None:
             with suppress(lab.LabError):
