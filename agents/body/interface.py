@@ -7,7 +7,7 @@ The runtime finds bodies by the entry-point group `zenpark.bodies`: the word bef
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import nan
 from typing import Annotated, Any, ClassVar, Final, Literal, TypeVar
@@ -15,6 +15,7 @@ from typing import Annotated, Any, ClassVar, Final, Literal, TypeVar
 import msgspec
 from msgspec import Meta
 
+from agents.body.device_address import DeviceAddress, plain_device
 from agents.body.kinds import Kind
 from agents.clock import Clock
 from agents.errors import ExplainedError
@@ -156,14 +157,25 @@ class Body(ABC):
     """
 
     SETTINGS: ClassVar[type[msgspec.Struct] | None] = None  # struct of the `device` table; None: any table is right
+    APART: ClassVar[str] = "give each its own address"  # remedy for two robots with one device
 
     @classmethod
     def faults(cls, robots: Sequence[BodyEntry]) -> Iterator[BodyFault]:
         """Faults of all robots of a file that have this body: of their addresses and tables, and of one beside another.
 
         Asked when a file is read, and again before the body is made; its library may be missing, and nothing is sent.
+        Two robots with one device are found without it.
         """
-        yield from shared_devices(robots, _plain_address, "warning")
+        yield from ()
+
+    @classmethod
+    def device_of(cls, robot: BodyEntry, endpoints: Sequence[str] = ()) -> DeviceAddress | None:
+        """Device that the address of a robot names, which one process of a computer drives; None for none.
+
+        Needed by bodies with addresses of another form than those of `plain_device`. Asked as `faults`, and with the
+        `endpoints` of a `BodyRequest` when the body is opened; raises BodyError for a wrong address.
+        """
+        return plain_device(robot.address)
 
     @abstractmethod
     def open(self) -> None:
@@ -232,24 +244,21 @@ def call_all(calls: Iterable[Callable[[], object]]) -> None:
             call_all(left)
 
 
-def _plain_address(robot: BodyEntry) -> str | None:
-    return robot.address.rstrip("/").lower() if "://" in robot.address else None
-
-
-def shared_devices(
-    robots: Iterable[BodyEntry],
-    device: Callable[[BodyEntry], Hashable | None],
-    severity: Literal["error", "warning"] = "error",
-) -> Iterator[BodyFault]:
-    """The faults of robots with one `device` on one machine; None: a robot without one."""
-    owners: dict[Hashable, str] = {}
-    for each in robots:
-        if (its := device(each)) is None:
-            continue
-        owner = owners.setdefault((each.host, its), each.name)
-        if owner != each.name:
+def shared_devices(robots: Iterable[tuple[BodyEntry, type[Body]]]) -> Iterator[BodyFault]:
+    """The faults of robots with one device on one machine, as far as no name server is asked."""
+    owners: dict[tuple[str, str], tuple[str, bool]] = {}  # robot by machine and key of its device, and if it is its own
+    for each, body in robots:
+        try:
+            device = body.device_of(each)
+        except BodyError:
+            continue  # `faults` says so
+        keys = [] if device is None else [((each.host, key), own) for key, own in device.lock_keys()]
+        known = [(owners[key], own) for key, own in keys if key in owners]
+        if owner := next((name for (name, whole), own in known if whole or own), ""):
             message = f"{owner} has the same body, {each.address}: one device gets the setpoints of both"
-            yield BodyFault(each.name, ("body",), message, "give each its own address", severity)
+            yield BodyFault(each.name, ("body",), message, body.APART)
+            continue
+        owners.update({key: (each.name, own) for key, own in keys})
 
 
 def judged(robot: BodyEntry, key: tuple[str | int, ...], parse: Callable[[], object]) -> Iterator[BodyFault]:
@@ -265,7 +274,8 @@ def refuse(body: type[Body], request: BodyRequest) -> None:
     """Raises BodyError for errors of the rows of a body, before it is made."""
     rows = zip(request.names, request.kinds, request.addresses, request.device, request.external, strict=True)
     entries = [BodyEntry(*row, process=request.names[0]) for row in rows]
-    if errors := [str(fault) for fault in body.faults(entries) if fault.severity == "error"]:
+    faults = [*body.faults(entries), *shared_devices((each, body) for each in entries)]
+    if errors := [str(fault) for fault in faults if fault.severity == "error"]:
         raise BodyError("; ".join(errors))
 
 

@@ -17,6 +17,7 @@ from typing import Final, Literal
 
 import zenoh
 
+from agents.body.device_locks import Claims
 from agents.body.external_pose import External
 from agents.body.interface import Body, BodyState, call_all
 from agents.body.measured_positions import MeasuredPositions
@@ -80,6 +81,7 @@ class Setup:
     lifeline_s: float = LIFELINE_S  # silence of the lifeline that counts as its loss [s]
     descent: DescentTiming = field(default_factory=DescentTiming)
     ownership: OwnershipTiming = field(default_factory=OwnershipTiming)
+    claims: Claims = field(default_factory=Claims)  # locks on the devices of the body
 
 
 class Runtime:
@@ -144,6 +146,8 @@ class Runtime:
             self.subscribe_to_stops(session)
             self.keeper.claim(session, self._setup.endpoints, asked)
             out.callback(self.keeper.ownership.end)
+            out.callback(self._setup.claims.release)
+            self._setup.claims.take()
             self._body.open()
             self._descent.register(out)
             self.join(session)

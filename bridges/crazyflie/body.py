@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from math import inf, isfinite
 from typing import Final
 
-from agents.body.device_locks import Claims
+from agents.body.device_address import DeviceAddress
 from agents.body.external_pose import External
 from agents.body.interface import Body, BodyEntry, BodyError, BodyFault, BodyRequest, BodyState, RangeScan
 from agents.clock import uptime, wait_until
@@ -50,10 +50,14 @@ class CrazyflieBody(Body):
         """See `Body.faults`."""
         return file_faults(robots)
 
+    @classmethod
+    def device_of(cls, robot: BodyEntry, endpoints: Sequence[str] = ()) -> DeviceAddress:
+        """See `Body.device_of`."""
+        return device_of(address(robot.name, robot.address))
+
     def __init__(self, request: BodyRequest, measuring_s: float = MEASURING_S) -> None:
         self._names, self._measuring_s = request.names, measuring_s
         self._addresses = addresses = [address(*pair) for pair in zip(request.names, request.addresses, strict=True)]
-        self._claims = Claims(request.names, [device_of(each) for each in addresses])
         settings = [
             chosen(name, device, external=outside)
             for name, device, outside in zip(request.names, request.device, request.external, strict=True)
@@ -90,10 +94,9 @@ class CrazyflieBody(Body):
         """See `Body.open`. Unreachable drones are left out, retried in the background, and named in the notes.
 
         Raises:
-            BodyError: If no drone is reachable, another process uses one, or a radio carries less than is asked of it.
+            BodyError: If no drone is reachable, or a radio carries less than is asked of it.
         """
         prepare(self._addresses)
-        self._claims.take()
         for pilot in self.pilots:
             pilot.start()
         wait_until(lambda: all(pilot.opened.is_set() or pilot.failure for pilot in self.pilots), self._open_timeout)
@@ -198,7 +201,6 @@ class CrazyflieBody(Body):
             pilot.close(land=land)
         for pilot in self.pilots:
             pilot.join()
-        self._claims.release()
 
     def _note(self, row: int, now: float) -> str:
         age = now - self._telemetry[row].pose_time

@@ -8,7 +8,7 @@ from functools import partial
 from itertools import combinations
 from typing import Final
 
-from agents.body.interface import BodyEntry, BodyFault, judged, settings, shared_devices
+from agents.body.interface import BodyEntry, BodyFault, judged, settings
 from bridges.crazyflie.geometry import check_anchors, in_one_plane, stations
 from bridges.crazyflie.protocol.addresses import (
     CrazyflieSettings,
@@ -17,7 +17,6 @@ from bridges.crazyflie.protocol.addresses import (
     Outside,
     address,
     air_of,
-    device_of,
     dongle_of,
 )
 from bridges.crazyflie.protocol.crazyradio import software
@@ -36,7 +35,6 @@ def file_faults(robots: Sequence[BodyEntry]) -> Iterator[BodyFault]:
         addressed += [each] if not wrong else []
         yield from _positioning(each)
     yield from _forwarded(robots)
-    yield from shared_devices(addressed, lambda each: device_of(each.address))
     yield from _radios([each for each in addressed if dongle_of(each.address) and software(each.address) is None])
 
 

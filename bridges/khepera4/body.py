@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Final
 
-from agents.body.device_locks import Claims
+from agents.body.device_address import DeviceAddress
 from agents.body.external_pose import External
 from agents.body.interface import (
     UNANSWERED,
@@ -20,7 +21,6 @@ from agents.body.interface import (
     RangeScan,
     judged,
     settings,
-    shared_devices,
 )
 from agents.clock import uptime, wait_until
 from agents.network.messages import Inspection
@@ -40,16 +40,21 @@ class KheperaBody(Body):
     @classmethod
     def faults(cls, robots: Sequence[BodyEntry]) -> Iterator[BodyFault]:
         """See `Body.faults`."""
-        places: dict[str, str] = {}  # addresses by robot
         for each in robots:
             wrong = list(judged(each, ("body",), partial(KheperaAddress.parse, each.name, each.address)))
             yield from wrong
             if not wrong:
                 address = KheperaAddress.parse(each.name, each.address)
                 chosen = settings(protocol.Khepera4Settings, each.name, each.device)
-                places[each.name] = str(address)
                 yield from judged(each, ("device", "server"), partial(address.server_of, each.name, chosen))
-        yield from shared_devices(robots, lambda each: places.get(each.name))
+
+    @classmethod
+    def device_of(cls, robot: BodyEntry, endpoints: Sequence[str] = ()) -> DeviceAddress:
+        """See `Body.device_of`."""
+        address = KheperaAddress.parse(robot.name, robot.address)
+        if address.serial:
+            return DeviceAddress(robot.address, parts=(os.path.realpath(address.serial),))
+        return DeviceAddress(robot.address, (address.host,), (str(address.port),))
 
     def __init__(self, request: BodyRequest, open_s: float = OPEN_S, first_answer_s: float = FIRST_ANSWER_S) -> None:
         """Deadlines [s] of the first odometry, and of a server's first answer."""
@@ -59,7 +64,6 @@ class KheperaBody(Body):
         self._settings = [
             settings(protocol.Khepera4Settings, *row) for row in zip(request.names, request.device, strict=True)
         ]
-        self._claims = Claims(request.names, [address.device for address in self._addresses])
         self._start = [(x, y, yaw) for (x, y, _), yaw in zip(request.start, request.yaw, strict=True)]
         self._outside = request.external
         self._external = [External() for _ in self._names]
@@ -69,9 +73,7 @@ class KheperaBody(Body):
     def open(self) -> None:
         """See `Body.open`. Robots without answer are retried while the others drive."""
         places = zip(self._names, self._addresses, self._settings, self._start, strict=True)
-        links = [Khepera4Link(*place, self._first_answer_s) for place in places]  # raises before a claim is taken
-        self._claims.take()
-        self._links = links
+        self._links = links = [Khepera4Link(*place, self._first_answer_s) for place in places]
         for link in links:
             link.start()
         wait_until(lambda: all(link.odometry.stamp > -math.inf or link.refused for link in links), self._open_s)
@@ -137,7 +139,6 @@ class KheperaBody(Body):
         for link in self._links:
             link.join()
         self._links = []
-        self._claims.release()
 
     @staticmethod
     def _note(link: Khepera4Link, now: float) -> str:

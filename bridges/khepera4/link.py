@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from typing import Final
 from urllib.parse import parse_qsl, urlsplit
 
-from agents.body.device_locks import numeric
 from agents.body.interface import FRESH_S, BodyError
 from agents.clock import uptime
 from agents.ticks import Ticks
@@ -87,11 +86,6 @@ class KheperaAddress:
 
     def __str__(self) -> str:
         return self.serial or f"{self.host}:{self.port}"
-
-    @property
-    def device(self) -> str:
-        """Canonical address, independent of aliases of the host or the line."""
-        return os.path.realpath(self.serial) if self.serial else f"{numeric(self.host)}:{self.port}"
 
     def connect(self) -> Wire:
         """Open the connection or line; raises OSError if that fails."""

@@ -10,12 +10,10 @@ import contextlib
 import math
 import threading
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from functools import partial
-from itertools import combinations
 from typing import Final
 
-from agents.body.device_locks import Claims
+from agents.body.device_address import DeviceAddress
 from agents.body.external_pose import External
 from agents.body.interface import (
     FRESH_S,
@@ -28,7 +26,6 @@ from agents.body.interface import (
     call_all,
     judged,
     settings,
-    shared_devices,
 )
 from agents.clock import uptime, wait_until
 from agents.vectors import UNKNOWN, ZERO, Setpoint, Vector
@@ -46,17 +43,14 @@ class TelloBody(Body):
     """Tellos. One process flies all Tellos of a computer."""
 
     SETTINGS = protocol.TelloSettings
+    APART = f"{Body.APART}, or name the network interface of each, as in tello://{protocol.HOST}%wlan1"
 
     @classmethod
     def faults(cls, robots: Sequence[BodyEntry]) -> Iterator[BodyFault]:
         """See `Body.faults`."""
-        places: dict[str, protocol.TelloPlace] = {}  # places of robots, by name
         first: dict[str, BodyEntry] = {}  # entries by machine
         for each in robots:
-            wrong = list(judged(each, BODY, partial(protocol.endpoint, each.name, each.address)))
-            yield from wrong
-            if not wrong:
-                places[each.name] = protocol.endpoint(each.name, each.address)
+            yield from judged(each, BODY, partial(protocol.endpoint, each.name, each.address))
             if not each.external:
                 message, remedy = "a Tello does not measure its position", 'write position = "external"'
                 yield BodyFault(each.name, ("position",), message, remedy)
@@ -65,14 +59,12 @@ class TelloBody(Body):
                 message = f"{other.name} and {each.name} are Tellos of one computer, all of which one process drives"
                 process = "tellos" if other.process == other.name else other.process
                 yield BodyFault(each.name, BODY, message, f'give each process = "{process}"')
-        for fault in shared_devices(robots, lambda each: places[each.name].device if each.name in places else None):
-            remedy = f"{fault.remedy}, or name the network interface of each, as in tello://{protocol.HOST}%wlan1"
-            yield replace(fault, remedy=remedy)
-        for one, two in combinations([each for each in robots if each.name in places], 2):
-            a, b = places[one.name], places[two.name]
-            if (one.host, a.host) == (two.host, b.host) and bool(a.interface) != bool(b.interface):
-                message = f"{one.name} and {two.name} have the address {a.host}, one of them without its interface"
-                yield BodyFault(two.name, BODY, message, f"name that of both, as in tello://{a.host}%wlan1")
+
+    @classmethod
+    def device_of(cls, robot: BodyEntry, endpoints: Sequence[str] = ()) -> DeviceAddress:
+        """See `Body.device_of`: a Tello has one port."""
+        place = protocol.endpoint(robot.name, robot.address)
+        return DeviceAddress(robot.address, (place.host,), (place.interface,))
 
     def __init__(self, request: BodyRequest, open_s: float = OPEN_S) -> None:
         """`open_s`: deadline of the first state line [s]."""
@@ -82,7 +74,6 @@ class TelloBody(Body):
         self._settings = [
             settings(protocol.TelloSettings, *row) for row in zip(request.names, request.device, strict=True)
         ]
-        self._claims = Claims(self._names, [f"tello://{each.device}" for each in self._endpoints])
         self._start_yaw = request.yaw
         self._external = [External() for _ in self._names]
         self._library: TelloLibrary | None = None
@@ -94,12 +85,7 @@ class TelloBody(Body):
 
     def open(self) -> None:
         """See `Body.open`. Drones without answer are retried while the others fly."""
-        self._claims.take()
-        try:
-            library = self._library = TelloLibrary(interfaces=[each.interface for each in self._endpoints])
-        except BodyError:
-            self._claims.release()
-            raise
+        library = self._library = TelloLibrary(interfaces=[each.interface for each in self._endpoints])
         self.pilots = [
             TelloPilot(library.drone(place), kind, chosen)
             for place, kind, chosen in zip(self._endpoints, self._kinds, self._settings, strict=True)
@@ -184,7 +170,6 @@ class TelloBody(Body):
             if self._library is not None:
                 self._library.close()
                 self._library = None
-            self._claims.release()
 
     def _run(self, library: TelloLibrary) -> None:
         period = 1.0 / max(chosen.rc_hz for chosen in self._settings)

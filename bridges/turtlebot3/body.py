@@ -14,7 +14,7 @@ from typing import Final
 
 import zenoh
 
-from agents.body.device_locks import Claims
+from agents.body.device_address import DeviceAddress
 from agents.body.external_pose import External
 from agents.body.interface import (
     Body,
@@ -26,11 +26,11 @@ from agents.body.interface import (
     call_all,
     judged,
     settings,
-    shared_devices,
 )
 from agents.clock import uptime
 from agents.errors import ExplainedError
 from agents.network import session as network
+from agents.network.endpoints import Endpoint
 from agents.network.messages import Inspection, number
 from agents.network.shutdown import leave
 from agents.vectors import UNKNOWN, Setpoint, Vector
@@ -64,20 +64,28 @@ class TurtleBot3(Body):
     @classmethod
     def faults(cls, robots: Sequence[BodyEntry]) -> Iterator[BodyFault]:
         """See `Body.faults`."""
-        places: dict[str, tuple[object, ...]] = {}  # endpoint and topics by robot
         for each in robots:
             chosen = settings(turtlebot3.TurtleBot3Settings, each.name, each.device)
-            wrong = list(judged(each, ("body",), partial(turtlebot3.address, each.name, each.address, chosen)))
-            yield from wrong
-            if not wrong:
-                where = turtlebot3.address(each.name, each.address, chosen)
-                places[each.name] = chosen.endpoint, where.style, where.namespace, where.domain
-        yield from shared_devices(robots, lambda each: places.get(each.name))
+            yield from judged(each, ("body",), partial(turtlebot3.address, each.name, each.address, chosen))
+
+    @classmethod
+    def device_of(cls, robot: BodyEntry, endpoints: Sequence[str] = ()) -> DeviceAddress:
+        """See `Body.device_of`: what a router has by one namespace; DDS behind ros2dds has any domain."""
+        chosen = settings(turtlebot3.TurtleBot3Settings, robot.name, robot.device)
+        where = turtlebot3.address(robot.name, robot.address, chosen)
+        try:
+            routers = [Endpoint.parse(each) for each in ((chosen.endpoint,) if chosen.endpoint else endpoints)]
+        except ValueError as error:
+            raise BodyError(f"{robot.name}: device.endpoint: {error}") from None
+        ports = ",".join(sorted({str(each.port) for each in routers}))
+        domain = str(where.domain) if where.style == "rmw" else ""
+        return DeviceAddress(
+            robot.address, tuple(each.host for each in routers), (ports, f"/{where.namespace}", domain)
+        )
 
     def __init__(self, request: BodyRequest, clock: Clock = uptime, open_timeout: float = OPEN_S) -> None:
         self._clock, self._open_timeout = clock, open_timeout
         self.robots = [TurtleBotConnection(request, row) for row in range(len(request.names))]
-        self._claims = Claims([robot.name for robot in self.robots], [robot.device for robot in self.robots])
         self._sessions: dict[tuple[str, ...], zenoh.Session] = {}
         self._outside = request.external
         self._external = [External() for _ in self.robots]
@@ -87,7 +95,6 @@ class TurtleBot3(Body):
 
     def open(self) -> None:
         """See `Body.open`: returns after the first odometry of every robot."""
-        self._claims.take()
         deadline = self._clock() + self._open_timeout
         try:
             participants: dict[tuple[object, ...], Participant] = {}
@@ -248,4 +255,3 @@ class TurtleBot3(Body):
         for session in self._sessions.values():
             leave(session, self)
         self._sessions.clear()
-        self._claims.release()

@@ -133,13 +133,6 @@ class TurtleBotConnection:
         self._watch = pubsub.AliveWatch(participant.session, watched)
         self.joined = True
 
-    @property
-    def device(self) -> str:
-        """Canonical address: namespace and endpoint."""
-        where = self.address
-        domain = f"?domain={where.domain}" if where.style == "rmw" else ""
-        return f"{where.style}://{where.namespace}{domain} by {', '.join(self.endpoints)}"
-
     # ------------------------------------------------------------------ reception
 
     def receive_messages(self, t: float, now: float) -> None:

@@ -17,6 +17,7 @@ from typing import Annotated, Any, Final
 
 from msgspec import Meta, Struct
 
+from agents.body.device_address import DeviceAddress
 from agents.body.interface import BodyError
 from agents.errors import did_you_mean
 from agents.plugins import registry
@@ -130,7 +131,7 @@ def _enabled(root: YamlValue, notes: list[str]) -> list[SwarmDrone]:
                 left.append(name)
         except DocumentError as error:
             problems += error.problems
-    first: dict[str, SwarmDrone] = {}
+    first: dict[DeviceAddress, SwarmDrone] = {}
     for each in drones:
         other = first.setdefault(protocol.device_of(each.uri), each)
         if other is not each:

@@ -10,7 +10,7 @@ from typing import Any, Final
 import msgspec
 import numpy as np
 
-from agents.body.interface import Body, BodyEntry, BodyError, BodyFault, BodyRequest
+from agents.body.interface import Body, BodyEntry, BodyError, BodyFault, BodyRequest, shared_devices
 from agents.body.kinds import KINDS, Kind
 from agents.network.keys import Keys
 from agents.plugins import registry
@@ -74,6 +74,7 @@ def body_faults(experiment: Experiment) -> Iterator[BodyFault]:
         external, process = robot.position == "external", robot.process or name
         entry = BodyEntry(name, kind, robot.body, robot.device, external, process, hosts.get(name, ""))
         entries.setdefault(body, []).append(entry)
+    yield from shared_devices((each, body) for body, its in entries.items() for each in its)
     for body, its in entries.items():
         yield from body.faults(its)
 

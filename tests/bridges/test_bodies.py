@@ -1,20 +1,17 @@
 """Refusals of all bodies: wrong rows before they open, and a device that another process drives."""
 
-import select
-import socket
-from contextlib import ExitStack, suppress
+from dataclasses import replace
 
 import pytest
 
 from agents.body.device_locks import Claims
 from agents.body.interface import BodyError, refuse
+from agents.plugins import registry
 from bridges.crazyflie.body import CrazyflieBody
-from bridges.crazyflie.protocol.addresses import device_of
 from bridges.khepera4.body import KheperaBody
-from bridges.khepera4.link import KheperaAddress
+from bridges.khepera4.protocol import PARK_PORT
 from bridges.tello.body import TelloBody
 from bridges.turtlebot3.body import TurtleBot3
-from tests.bridges.turtlebot3 import turtlebots
 from tests.requests import request
 
 pytestmark = pytest.mark.usefixtures("runtime_folder")
@@ -77,7 +74,7 @@ def made(body, asked):
         ("crazyflie", RADIO, OUTSIDE, False, "needs position = "),
         ("tello", "tello", {}, False, 'a Tello does not measure its position; write position = "external"'),
         ("tello", [TELLO, f"{TELLO}:1"], {}, True, "R1: R0 has the same body, tello://10.*192.168.10.1%wlan1"),
-        ("tello", [f"{TELLO}%wlan1", TELLO], {}, True, "10.0.0.2, one of them without its interface; name that"),
+        ("tello", [f"{TELLO}%wlan1", TELLO], {}, True, "R0 has the same body, tello://10.*name the network"),
         ("tello", f"{TELLO}%", {}, True, "names no network interface"),
     ],
 )
@@ -87,55 +84,39 @@ def test_wrong_addresses_and_settings_are_named(kind, addresses, device, externa
         made(BODIES[kind], asked)
 
 
-def crazyflie(port):
-    return CrazyflieBody(request("crazyflie", [f"udp://127.0.0.1:{port}"])), device_of(f"udp://localhost:{port}")
+# two names of one device of each body
+NAMES = {
+    "radio": (RADIO, f"{RADIO[:-10]}e7e7e7e701?rate_limit=100"),
+    "usb": ("usb://0", "usb://00"),
+    "udp": ("udp://localhost:19850", "udp://127.0.0.1:19850"),
+    "khepera4": ("khepera4://localhost", f"kteam://127.1:{PARK_PORT}"),
+    "kteam": ("kteam:///dev/stdin", "kteam:///proc/self/fd/0"),
+    "tello": ("tello://192.0.2.7", "tello://192.0.2.7%wlan1:1"),
+    "ros2dds": ("ros2dds://tb3_0?distro=humble", "rmw://tb3_0"),
+    "rmw": ("rmw://tb3_0?domain=3", "rmw://tb3_0/?distro=jazzy&domain=3"),
+}
 
 
-def khepera(port):
-    device = KheperaAddress.parse("R0", f"kteam://localhost:{port}").device
-    return KheperaBody(request("khepera4", [f"khepera4://127.0.0.1:{port}"])), device
+@pytest.mark.parametrize("word", NAMES)
+def test_body_knows_its_device_by_any_name(word):
+    body = registry.load(registry.BODIES, word)
+    kind = next(kind for kind, each in BODIES.items() if each is body)
+    routers = ("tcp/127.0.0.1:7447", "tls/localhost:7447")
+    asked = [
+        replace(request(kind, [address]), endpoints=(router,))
+        for address, router in zip(NAMES[word], routers, strict=True)
+    ]
+    first, second = map(Claims.of, asked)
+    first.take()
+    with pytest.raises(BodyError, match="is in use: this process drives it for R0; end that first"):
+        second.take()
+    first.release()
 
 
-def tello(port):
-    return TelloBody(request("tello", [f"tello://127.0.0.1:{port}"], external=True)), "tello://127.0.0.1"
-
-
-def turtlebot(port):
-    endpoint = f"tcp/127.0.0.1:{port}"
-    return TurtleBot3(turtlebots.request(endpoint, "ros2dds://tb3_0?distro=humble")), f"ros2dds://tb3_0 by {endpoint}"
-
-
-def free_for_both(stack):
-    """Sockets of UDP and TCP at one port, which other processes may have for one of the two."""
-    while True:
-        packets = stack.enter_context(socket.socket(type=socket.SOCK_DGRAM))
-        connections = stack.enter_context(socket.socket())
-        packets.bind(("127.0.0.1", 0))
-        with suppress(OSError):
-            connections.bind(("127.0.0.1", port := packets.getsockname()[1]))
-            return packets, connections, port
-
-
-@pytest.mark.parametrize("opened", [crazyflie, khepera, tello, turtlebot])
-def test_driven_device_gets_nothing_from_a_second_process(opened):
-    with ExitStack() as both:
-        packets, connections, port = free_for_both(both)
-        connections.listen()
-        body, device = opened(port)
-        first = Claims(["CF07"], [device])
-        first.take()
-        with pytest.raises(BodyError, match="is in use: this process drives it for CF07; end that first"):
-            body.open()
-        body.close()
-        assert select.select([packets, connections], [], [], 0.0)[0] == []
-        first.release()
-
-
-@pytest.mark.slow
-def test_unopened_body_leaves_its_device_to_others():
-    with socket.socket() as nobody:
-        nobody.bind(("127.0.0.1", 0))
-        body, device = khepera(nobody.getsockname()[1])  # refuses connections: it does not listen
-        with pytest.raises(BodyError, match="no Khepera answers"):
-            body.open()
-        Claims(["CF07"], [device]).take()
+def test_every_device_has_two_names():
+    registered = registry.registered(registry.BODIES)
+    assert {
+        name
+        for name, (entry, *_) in registered.items()
+        if entry.value.startswith("bridges.") and entry.module != "bridges.external"
+    } == NAMES.keys()

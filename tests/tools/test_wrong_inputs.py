@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from agents.body.interface import BodyEntry
+from agents.body.interface import BodyEntry, shared_devices
 from bridges.khepera4.kind import KHEPERA4
 from experiments.check.safety import libraries
 from experiments.definition.plan import Plan
@@ -149,8 +149,11 @@ def test_two_robots_with_one_devices_address_are_found(second, same):
         entries = [
             BodyEntry(name, KHEPERA4, body, {}, external=False, process=name, host=at) for name, body, at in rows
         ]
-        return [(each.severity, each.robot, each.key, each.message) for each in TwinBody.faults(entries)]
+        return [
+            (each.severity, each.robot, each.key, each.message)
+            for each in shared_devices((each, TwinBody) for each in entries)
+        ]
 
     message = f"RV01 has the same body, {second}: one device gets the setpoints of both"
-    assert found("") == ([("warning", "RV03", ("body",), message)] if same else [])
+    assert found("") == ([("error", "RV03", ("body",), message)] if same else [])
     assert found("lab") == []

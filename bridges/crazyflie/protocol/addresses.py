@@ -10,7 +10,7 @@ from typing import Annotated, Any, Final, Literal
 import msgspec
 from msgspec import Meta
 
-from agents.body.device_locks import numeric
+from agents.body.device_address import DeviceAddress
 from agents.body.interface import BodyError, settings
 from agents.vectors import NotNegative, Positive
 from bridges.crazyflie.protocol.crazyradio import software
@@ -130,18 +130,20 @@ def address(name: str, given: str) -> str:
     return given
 
 
-def device_of(address: str) -> str:
-    """Canonical address of a Crazyflie, without what belongs to the computer (which radio, its options)."""
+def device_of(address: str) -> DeviceAddress:
+    """Device of a Crazyflie's address, without what belongs to the computer (which radio, its options)."""
     scheme, _, rest = address.partition("?")[0].partition("://")
     if scheme == "radio":
         _, channel, rate, *own = rest.split("/")
         simulated = software(address)
-        air = "" if simulated is None else f"simulated at {simulated.host}:{simulated.port}, "
-        return f"{air}radio channel {channel}, {rate}, address {(own[0] if own else DEFAULT_ADDRESS).upper():0>10}"
+        hosts = () if simulated is None else (simulated.host,)
+        air = "" if simulated is None else f"{simulated.port} "
+        own_address = (own[0] if own else DEFAULT_ADDRESS).upper()
+        return DeviceAddress(address, hosts, (f"{air}radio {channel} {rate} {own_address:0>10}",))
     if scheme == "udp":
         host, _, port = rest.partition(":")
-        return f"udp://{numeric(host)}:{int(port)}"
-    return f"{scheme}://{int(rest)}"
+        return DeviceAddress(address, (host,), (str(int(port)),))
+    return DeviceAddress(address, parts=(f"{scheme}://{int(rest)}",))
 
 
 def air_of(address: str) -> tuple[int, str]:

@@ -23,6 +23,7 @@ from typing import Annotated, Final
 
 import msgspec
 
+from agents.body.device_locks import Claims
 from agents.body.fleet import assemble
 from agents.body.shadow_twin import shadowed
 from agents.clock import Clock
@@ -117,6 +118,7 @@ def _run(plan: Plan, launch: RobotLaunch, endpoints: Sequence[str]) -> int:
         rights=mesh.member_rights(plan, endpoints),
         loop_timeout_s=experiment.safety.loop_timeout_s,
         wake=plan.wakes,
+        claims=Claims.of(request),
     )
     return Runtime(assignments, body, setup).run()
 

@@ -1,4 +1,4 @@
-"""Several bodies in one process look like one, and lock their devices; a twin beside a robot is never in its way."""
+"""Several bodies in one process look like one; a twin beside a robot is never in its way."""
 
 from functools import partial
 from math import inf, isfinite, isnan, nan
@@ -6,16 +6,13 @@ from math import inf, isfinite, isnan, nan
 import pytest
 
 from agents.body import fleet
-from agents.body.device_locks import Claims, numeric
 from agents.body.fleet import Fleet, assemble
 from agents.body.interface import Body, BodyError, BodyState, Disturbance
 from agents.body.shadow_twin import Shadowed, shadowed
 from agents.network.messages import Inspection
 from agents.plugins import registry
 from agents.vectors import NO_SETPOINT, UNKNOWN, ZERO
-from bridges.crazyflie.protocol.addresses import device_of
 from tests.cases import for_each
-from tests.commands import started
 from tests.requests import request
 from twins.body import TwinBody
 
@@ -129,7 +126,7 @@ def test_addresses_choose_the_bodies(monkeypatch):
             return loaded(group, name)
 
         class Asked(Recorded):
-            faults = staticmethod(Body.faults)
+            faults, device_of = staticmethod(Body.faults), staticmethod(Body.device_of)
 
             def __init__(self, part):
                 asked.append((group, name, part.names, part.addresses, [y for _, y, _ in part.start]))
@@ -262,64 +259,3 @@ def test_twin_is_undisturbed(kind):
     assert second.position[0] == pytest.approx(1.2)
     # it took over the robot's speed with its place
     assert second.shadow_position == (pytest.approx(1.2), 0.0, 0.0)
-
-
-HOLDER = """
-from agents.body.device_locks import Claims
-Claims(["CF07"], ["radio 80"]).take()
-print("has it", flush=True)
-input()
-"""
-
-
-def test_device_has_one_holder_until_released(runtime_folder):
-    first, second = Claims(["A", "B"], ["one", "two"]), Claims(["C", "D"], ["three", "two"])
-    first.take()
-    with pytest.raises(BodyError, match=r"^D: two is in use: this process drives it for B; end that first$"):
-        second.take()
-    second.release()  # refused: what the first has is left alone
-    assert len(list(runtime_folder.iterdir())) == 2
-    Claims(["C"], ["three"]).take()  # which the second has let go of
-    first.release()
-    second.release()
-    first.release()
-    third = Claims(["D"], ["two"])
-    third.take()
-    third.release()
-
-
-def test_holder_is_named_and_its_death_frees_device(runtime_folder):
-    mine = Claims(["CF01"], ["radio 80"])
-    with started("-c", HOLDER) as other:
-        assert other.stdout.readline() == "has it\n"
-        with pytest.raises(BodyError, match=f"^CF01: radio 80 is in use: process {other.pid} drives it for CF07; end"):
-            mine.take()
-    assert len(list(runtime_folder.iterdir())) == 1  # the file is left, the lock is not
-    mine.take()
-    mine.release()
-    assert list(runtime_folder.iterdir()) == []
-
-
-def test_without_a_folder_nothing_is_driven(runtime_folder):
-    runtime_folder.mkdir(0o755)
-    runtime_folder.chmod(0o777)
-    with pytest.raises(
-        BodyError, match=r"no lock on radio 80, .* set ZENPARK_RUNTIME_DIR to a folder that is yours alone"
-    ):
-        Claims(["CF01"], ["radio 80"]).take()
-
-
-def test_spellings_of_one_crazyflie_are_one_device():
-    spellings = [
-        ("radio://0/80/2M", "radio://1/80/2M/e7e7e7e7e7?rate_limit=100"),
-        ("radio://0/80/2M/E7E7E7E701", "radio://0/80/2M/e7e7e7e701"),
-        ("radio://0/80/2M/1", "radio://E7ABCD/80/2M/0000000001"),
-        ("usb://0", "usb://00"),
-        ("udp://localhost:19850", "udp://127.0.0.1:19850"),
-        *(("radio://0/80/2M/E7E7E7E702",), ("radio://0/81/2M/E7E7E7E701",), ("radio://0/80/1M/E7E7E7E701",)),
-        *(("usb://1",), ("udp://127.0.0.1:1",), ("udp://127.0.0.1:2",)),
-    ]
-    devices = [{device_of(address) for address in addresses} for addresses in spellings]
-    assert [len(each) for each in devices] == [1] * len(spellings)
-    assert len(set.union(*devices)) == len(spellings)
-    assert [numeric("No.Such.invalid"), numeric("127.1")] == ["no.such.invalid", "127.0.0.1"]

@@ -10,6 +10,9 @@ from typing import ClassVar
 
 import pytest
 
+from agents.body.device_address import plain_device
+from agents.body.device_locks import Claims
+from agents.body.interface import BodyError
 from agents.body.limits import Safety
 from agents.decision.lifecycle import AIRBORNE, READY, RUNNING, Phase
 from agents.decision.neighbours import Neighbours
@@ -250,6 +253,22 @@ def test_stop_while_body_opens_keeps_it_down(way, on_stage, net):
     stage.run(visit, joined=True)
     assert [order for _, order in stage.orders] == ["stop"]
     assert stage.robot.lifecycle.reason.startswith(messages.EMERGENCY)
+
+
+@pytest.mark.usefixtures("net", "runtime_folder")
+def test_body_stays_closed_while_another_drives():
+    claims = Claims([("F", plain_device("rover://localhost:5005"))])
+    driver = Claims([("R7", plain_device("rover://127.0.0.1"))])
+    body = Airborne()
+    driver.take()
+    with pytest.raises(BodyError, match="in use: this process drives it for R7"):
+        process(WHEELS, body, claims=claims).run()
+    assert body.calls == []
+    driver.release()
+    with Net().worn(), pytest.raises(OSError, match="the loop breaks"):
+        process(WHEELS, body, claims=claims).run()
+    driver.take()  # let go of at the end
+    assert body.order[0] == "open"
 
 
 class Wire(ManualClock):

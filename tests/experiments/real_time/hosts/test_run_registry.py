@@ -12,6 +12,7 @@ import msgspec
 import psutil
 import pytest
 
+from agents.body.device_address import DeviceAddress
 from agents.body.device_locks import Claims
 from agents.body.interface import BodyError
 from agents.network.endpoints import free_endpoint
@@ -182,13 +183,13 @@ def test_shells_of_one_user_list_same_runs(shells, tmp_path):
 
 def test_shells_of_one_user_share_locks(shells):
     shells("session")
-    driver = Claims(["A"], ["radio 80"])
+    driver = Claims([("A", DeviceAddress("radio 80", parts=("80",)))])
     driver.take()
     shells()
     with pytest.raises(BodyError, match="radio 80 is in use"):
-        Claims(["B"], ["radio 80"]).take()
+        Claims([("B", DeviceAddress("radio 80", parts=("80",)))]).take()
     driver.release()
-    Claims(["B"], ["radio 80"]).take()
+    Claims([("B", DeviceAddress("radio 80", parts=("80",)))]).take()
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="looks into the folders of others as root")
