@@ -32,6 +32,7 @@ POSES: Final = 16  # queued poses of one robot
 EVENTS: Final = 64  # events of a run, repeated to a subscriber that was cut off: without a router much happens at once
 SOURCES: Final = 4096  # publishers with known numbers
 ORDERS: Final = 8  # queued
+REPORTS: Final = 8192  # queued reports of all robots of a realm
 LONGEST_ORDER: Final = 4096  # [bytes] an order to land or to stop is shorter
 TOKEN_CHANGES: Final = 256  # queued
 NO_ORDER: Final = 'an order is a query with a payload, such as {"order": "land"}'
@@ -282,6 +283,12 @@ class Inbox(Generic[M]):
                 if self._robots is None or getattr(message, "robot", "") in self._robots:
                     yield message, sample
 
+    def newest(self) -> Iterator[M]:
+        """The last queued message of each key; those before it are not decoded."""
+        for sample in {str(sample.key_expr): sample for sample in iter(self.take, None)}.values():
+            for message, _ in self.read_from(sample):
+                yield message
+
     def refuse(self, reason: str) -> None:
         """Count a payload as refused."""
         self.malformed += 1
@@ -465,3 +472,26 @@ class AliveWatch:
         """Key of each token that appeared (True) or vanished (False) since the last call, oldest first."""
         for sample in received(self.handler):
             yield str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
+
+
+class RobotFeed:
+    """Reports of the robots of a realm to those that watch them: statuses, states, and liveliness; polled."""
+
+    def __init__(self, session: zenoh.Session, keys: Keys, robots: Container[str] | None = None) -> None:
+        """Subscribes; reports of other names than `robots` are dropped, of none if that is None."""
+        self._keys = keys
+        statuses = pose_subscriber(session, keys.status("*"), REPORTS)
+        self.statuses = Inbox(statuses, messages.Status, keys=keys, robots=robots)
+        self.states = Inbox(subscriber(session, keys.state("*"), REPORTS), messages.State, keys=keys, robots=robots)
+        self._tokens = AliveWatch(session, keys.alive("*"))
+
+    @property
+    def malformed(self) -> int:
+        """Reports that were refused."""
+        return self.statuses.malformed + self.states.malformed
+
+    def alive(self) -> Iterator[tuple[str, bool]]:
+        """Name of each robot that came (True) or went (False) since the last call, oldest first."""
+        for token, there in self._tokens.changes():
+            if (robot := self._keys.whose(token)) is not None:
+                yield robot, there

@@ -99,10 +99,8 @@ class Graph:
         self._diagnostics = self._node.publisher("/diagnostics", ros2.DIAGNOSTIC_ARRAY)
         self._transforms = self._node.publisher("/tf", ros2.TF_MESSAGE, ros2.TRANSFORMS)
         self._robots: dict[str, _RobotTopics] = {}
-        self._states = pubsub.Inbox(pubsub.subscriber(session, keys.state("*"), 1024), messages.State, keys=keys)
+        self._feed = pubsub.RobotFeed(session, keys)
         self._ranges = pubsub.Inbox(pubsub.subscriber(session, keys.ranges("*"), 256), messages.Ranges, keys=keys)
-        self._statuses = pubsub.Inbox(pubsub.pose_subscriber(session, keys.status("*"), 256), messages.Status)
-        self._alive = pubsub.AliveWatch(session, keys.alive("*"))
         self._centres = pubsub.AliveWatch(session, keys.centre_alive)
         self._centralised = False
         self._clock = participant.clock
@@ -111,7 +109,7 @@ class Graph:
     @property
     def malformed(self) -> int:
         """Samples of the realm that were refused."""
-        return self._states.malformed + self._ranges.malformed + self._statuses.malformed
+        return self._feed.malformed + self._ranges.malformed
 
     @property
     def robots(self) -> tuple[str, ...]:
@@ -135,10 +133,7 @@ class Graph:
     def _update_robots(self) -> list[Message]:
         """Add and remove robots by their liveliness tokens; returns the diagnostics of the removed ones."""
         gone = []
-        for token, there in self._alive.changes():
-            name = self._keys.whose(token)
-            if name is None:
-                continue
+        for name, there in self._feed.alive():
             if not there:
                 if (robot := self._robots.pop(name, None)) is not None:
                     robot.close()
@@ -160,7 +155,7 @@ class Graph:
     def _publish_states(self) -> None:
         """Publish received states as pose, transform and velocity."""
         now, transforms = self._clock.utc(), []
-        for state in self._states.read(lambda state: validation.check_state(state, now=now, valid_box=VALID_BOX)):
+        for state in self._feed.states.read(lambda state: validation.check_state(state, now=now, valid_box=VALID_BOX)):
             if (robot := self._robots.get(state.robot)) is None:
                 continue
             robot.stamp = state.stamp
@@ -186,7 +181,7 @@ class Graph:
             robot.scan.put(made)
 
     def _diagnostics_of_statuses(self) -> list[Message]:
-        return [diagnosis(self._types, status) for status in self._statuses.read() if status.robot in self._robots]
+        return [diagnosis(self._types, status) for status in self._feed.statuses.read() if status.robot in self._robots]
 
     def _forward_goal(self, name: str, robot: _RobotTopics, message: Message) -> None:
         """Forward a goal from ROS into the realm, unless a central controller sends goals."""

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass, field
 from math import inf
-from typing import Final, TypeVar
+from typing import Final
 
 import numpy as np
 import zenoh
@@ -27,8 +25,6 @@ from experiments.view.heartbeat import DataAge
 
 UNKNOWN_S: Final = 2.0  # time without an experiment after which robots are drawn that are known by name only
 RATE_S: Final = 1.0
-Handler = zenoh.handlers.Handler[zenoh.Sample]
-R = TypeVar("R", messages.State, messages.LawMemory, messages.Ranges)
 DEPTH: Final = 8192  # samples between two rounds
 EVENTS: Final = 200  # kept
 
@@ -64,19 +60,16 @@ class Observer:
         self._session, self._keys = session, keys
         self._clock = Clock()
         self._experiments = pubsub.pose_subscriber(session, keys.experiment, 4)
-        self._states = pubsub.subscriber(session, keys.state("*"), DEPTH)
-        self._memories = pubsub.subscriber(session, keys.memory("*"), DEPTH)
+        self._feed = pubsub.RobotFeed(session, keys)
+        memories = pubsub.subscriber(session, keys.memory("*"), DEPTH)
+        self._memories = pubsub.Inbox(memories, messages.LawMemory, keys=keys)
         self._poses = pubsub.subscriber(session, keys.pose("*"), DEPTH)
-        self._statuses = pubsub.Inbox(
-            pubsub.pose_subscriber(session, keys.status("*"), 1024), messages.Status, keys=keys
-        )
-        self._told = pubsub.Inbox(pubsub.pose_subscriber(session, keys.event, 256, pubsub.EVENTS), messages.Event)
-        self._of_world = pubsub.Inbox(pubsub.subscriber(session, keys.world_event, 256), messages.Event)
+        self._run_events = pubsub.Inbox(pubsub.pose_subscriber(session, keys.event, 256, pubsub.EVENTS), messages.Event)
+        self._world_events = pubsub.Inbox(pubsub.subscriber(session, keys.world_event, 256), messages.Event)
         self._worlds = pubsub.Inbox(pubsub.subscriber(session, keys.world, 8), messages.WorldState)
         self._contacts = pubsub.Inbox(pubsub.subscriber(session, keys.contact, 256), messages.Contact)
-        self._watch = pubsub.AliveWatch(session, keys.alive("*"))
         self._conductor = pubsub.AliveWatch(session, keys.conductor)
-        self._ranges: zenoh.Subscriber[Handler] | None = None
+        self._ranges: pubsub.Inbox[messages.Ranges] | None = None
         self._opened = self._rated = time.monotonic()
         self.robots, self.scans = {}, {}
         self.events = deque(maxlen=EVENTS)
@@ -90,27 +83,26 @@ class Observer:
         """Takes in what has arrived; returns whether another case has begun, with another stage."""
         now = time.monotonic()
         changed = self._read_experiment()
-        for token, there in self._watch.changes():
-            if (name := self._keys.whose(token)) is not None:
-                report = self._report(name)
-                report.alive = there
-                report.known |= there
+        for name, there in self._feed.alive():
+            report = self._report(name)
+            report.alive = there
+            report.known |= there
         for _, there in self._conductor.changes():
             self.conducted = there
-        for status in self._statuses.read():
+        for status in self._feed.statuses.read():
             self._receive_status(status, now)
         self._read_states(now)
         for sample in received(self._poses.handler):
-            name = self._keys.whose(str(sample.key_expr))
-            if name is not None:
-                report = self._report(name)
+            sender = self._keys.whose(str(sample.key_expr))
+            if sender is not None:
+                report = self._report(sender)
                 report.sent_at, report.sent = now, report.sent + 1
-        self.events.extend(self._told.read())
-        self.events.extend(self._of_world.read(validation.check_world_event))
+        self.events.extend(self._run_events.read())
+        self.events.extend(self._world_events.read(validation.check_world_event))
         for world in self._worlds.read():
             self.world = world
         if self._ranges is not None:
-            self.scans |= {scan.robot: scan for scan in self._newest(self._ranges, messages.Ranges)}
+            self.scans |= {scan.robot: scan for scan in self._ranges.newest()}
         if now - self._rated >= RATE_S:
             for report in self.robots.values():
                 report.rate, report.sent = report.sent / (now - self._rated), 0
@@ -159,10 +151,10 @@ class Observer:
         report.known = True
 
     def _read_states(self, now: float) -> None:
-        states = list(self._newest(self._states, messages.State))
+        states = list(self._feed.states.newest())
         if states:
             self.age.add(max(state.stamp for state in states), self._clock.utc(), now)
-        for memory in self._newest(self._memories, messages.LawMemory):
+        for memory in self._memories.newest():
             self._report(memory.robot).memory = memory
         for state in states:
             report = self._report(state.robot)
@@ -185,20 +177,13 @@ class Observer:
             touching[overlap.first, overlap.second] = now, overlap
         self._touching = {pair: each for pair, each in touching.items() if now - each[0] < TOUCH_S}
 
-    def _newest(self, subscriber: zenoh.Subscriber[Handler], kind: type[R]) -> Iterator[R]:
-        """The last message of each robot."""
-        for key, sample in {str(sample.key_expr): sample for sample in received(subscriber.handler)}.items():
-            with suppress(messages.Malformed):
-                message = messages.decode(sample.payload.to_bytes(), str(sample.encoding), kind)
-                if self._keys.whose(key) == message.robot:
-                    yield message
-
     def watch_ranges(self, *, wanted: bool) -> None:
         """Receives range readings, or receives them no more."""
         if wanted and self._ranges is None:
-            self._ranges = pubsub.subscriber(self._session, self._keys.ranges("*"), DEPTH)
+            ranges = pubsub.subscriber(self._session, self._keys.ranges("*"), DEPTH)
+            self._ranges = pubsub.Inbox(ranges, messages.Ranges, keys=self._keys)
         elif not wanted and self._ranges is not None:
-            self._ranges.undeclare()
+            self._ranges.close()
             self._ranges = None
             self.scans.clear()
 
@@ -235,7 +220,7 @@ class Observer:
         heard = max(self.robots.values(), key=lambda report: report.heard_at, default=None)
         if heard is None or heard.status is None:
             return self._clock.utc()
-        return heard.status.stamp + time.monotonic() - heard.heard_at
+        return heard.status.stamp + (time.monotonic() - heard.heard_at)
 
     @property
     def overlaps(self) -> list[Overlap]:

@@ -46,7 +46,6 @@ KNOWN_S: Final = 0.3  # a robot that has told nothing for longer is not known
 SLACK_S: Final = 1.0  # added to the limits of rules, and so many times the largest lateness of the laboratory itself:
 LATENESSES: Final = 5.0
 ALOFT_M: Final = 0.1  # height over its lowest place from which on a drone flies
-DEPTH: Final = 8192  # messages that wait for the observer
 
 
 class RealTime:
@@ -366,12 +365,11 @@ class RealWorld(World):
     def _observe(self, endpoints: Sequence[str]) -> None:
         with contextlib.suppress(network.Unreachable):
             self._session = session = network.open_session(endpoints, name="chaos", identity="operator")
-            for key, kind, subscribe, keep in (
-                (self._keys.status("*"), messages.Status, pubsub.pose_subscriber, self._keep_status),
-                (self._keys.state("*"), messages.State, pubsub.subscriber, self._keep_state),
-                (self._keys.event, messages.Event, pubsub.subscriber, self._keep_event),
-            ):
-                self._inboxes.append((pubsub.Inbox(subscribe(session, key, DEPTH), kind), keep))
+            feed = pubsub.RobotFeed(session, self._keys)
+            events = pubsub.Inbox(pubsub.subscriber(session, self._keys.event), messages.Event)
+            self._inboxes += [
+                (feed.statuses, self._keep_status), (feed.states, self._keep_state), (events, self._keep_event)
+            ]  # fmt: skip
 
     def _keep_status(self, status: messages.Status) -> None:
         told, last = self.told[status.robot], self._statuses.get(status.robot)

@@ -13,7 +13,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import psutil
-import zenoh
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
@@ -81,9 +80,8 @@ class Watcher:
     def __init__(self, *endpoints):
         self.keys, self.alive, self._inboxes = Keys(), set(), []
         self.session = network.open_session(endpoints, name="test", identity="operator")
-        self.status = self.newest(self.keys.status("*"), messages.Status, pubsub.pose_subscriber)
-        self.state = self.newest(self.keys.state("*"), messages.State)
-        self._alive = pubsub.AliveWatch(self.session, self.keys.alive("*"))
+        self._feed = pubsub.RobotFeed(self.session, self.keys)
+        self.status, self.state = self._newest(self._feed.statuses), self._newest(self._feed.states)
 
     def every(self, key, kind, subscribe=pubsub.subscriber):
         """List to which each message of a key is appended."""
@@ -93,8 +91,10 @@ class Watcher:
 
     def newest(self, key, kind, subscribe=pubsub.subscriber):
         """Last message of each robot, by its name."""
+        return self._newest(pubsub.Inbox(subscribe(self.session, key, 8192), kind))
+
+    def _newest(self, inbox):
         found = {}
-        inbox = pubsub.Inbox(subscribe(self.session, key, 8192), kind)
         self._inboxes.append((inbox, lambda message: found.update({message.robot: message})))
         return found
 
@@ -102,9 +102,8 @@ class Watcher:
         for inbox, keep in self._inboxes:
             for message in inbox.read():
                 keep(message)
-        for sample in network.received(self._alive.handler):
-            robot = self.keys.whose(str(sample.key_expr)) or ""  # a test may hold a token on any key
-            (self.alive.discard if sample.kind == zenoh.SampleKind.DELETE else self.alive.add)(robot)
+        for robot, there in self._feed.alive():
+            (self.alive.add if there else self.alive.discard)(robot)
 
     def until(self, true, what, limit_s=PATIENCE_S):
         """Looks until something is true; while it asks for a robot that has said nothing yet, it is not."""

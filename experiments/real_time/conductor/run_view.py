@@ -169,11 +169,7 @@ class NetworkView:
         self._experiment.put(document.case_document(context.plan, context.case))
         self.orders = pubsub.Orders(session, keys.run_order, messages.RunOrder)  # orders to the conductor
         self._token = pubsub.alive_token(session, keys.conductor)
-        statuses = pubsub.pose_subscriber(session, keys.status("*"), 4096)
-        self._statuses = pubsub.Inbox(statuses, messages.Status, keys=keys, robots=self.robots)
-        states = pubsub.subscriber(session, keys.state("*"), 4096)
-        self._states = pubsub.Inbox(states, messages.State, keys=keys, robots=self.robots)
-        self._watch = pubsub.AliveWatch(session, keys.alive("*"))
+        self._feed = pubsub.RobotFeed(session, keys, self.robots)
         self._recorder_watch = pubsub.AliveWatch(session, keys.recorder)
         self.recording_begun = False  # the recorder is there
         self._recorder_vanished = inf  # [s, monotonic] loss of its token; infinity while it stands, or before its first
@@ -208,17 +204,17 @@ class NetworkView:
         for _, there in self._recorder_watch.changes():
             self.recording_begun |= there
             self._recorder_vanished = inf if there else time.monotonic()
-        for status in self._statuses.read():
+        for status in self._feed.statuses.read():
             self.receive_status(status)
-        self._progress.states = list(self._states.read())
+        self._progress.states = list(self._feed.states.read())
         arrived = self.clock.utc()
         for state in self._progress.states:
             view = self.robots[state.robot]
             view.behind = min(view.behind, arrived - state.stamp)
             view.error = state.error if view.linked else None
             view.place = state.true_position or state.position or view.place
-        for token, there in self._watch.changes():
-            if (known := self.robots.get(self._keys.whose(token) or "")) is not None:
+        for name, there in self._feed.alive():
+            if (known := self.robots.get(name)) is not None:
                 known.alive, known.vanished = there, inf if there else time.monotonic()
         now = time.monotonic()
         self._watch_router(now)
