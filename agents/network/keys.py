@@ -63,6 +63,7 @@ class Keys:
     run_order = _RealmKey("run/order")  # queryable: remove, restart, replace, add robots
     clock = _RealmKey("run/clock")  # clock offsets of other machines from the conductor's
     recorder = _RealmKey("run/recorder")  # liveliness token
+    scene = _RealmKey("run/scene")  # drawing of the case for RViz, a MarkerArray as CDR, from the recorder
     everything = _RealmKey("**")  # all keys of the realm
 
     @staticmethod

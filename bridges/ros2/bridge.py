@@ -1,7 +1,7 @@
 """The robots of a realm as ROS 2 topics over rmw_zenoh, without ROS here: `python -m bridges.ros2.bridge`.
 
-Published: /<robot>/pose, /<robot>/velocity, /<robot>/scan, /tf and /diagnostics. Subscribed: /<robot>/goal. A robot's
-topics exist while its liveliness token does; its scan from its first range readings on.
+Published: /<robot>/pose, /<robot>/velocity, /<robot>/scan, /tf, /scene and /diagnostics. Subscribed: /<robot>/goal. A
+robot's topics exist while its liveliness token does; its scan from its first range readings on.
 """
 
 from __future__ import annotations
@@ -98,6 +98,8 @@ class Graph:
         self._node = participant.node(NODE)
         self._diagnostics = self._node.publisher("/diagnostics", ros2.DIAGNOSTIC_ARRAY)
         self._transforms = self._node.publisher("/tf", ros2.TF_MESSAGE, ros2.TRANSFORMS)
+        self._markers = self._node.publisher("/scene", ros2.MARKER_ARRAY)
+        self._scenes = pubsub.subscriber(session, keys.scene, 4)
         self._robots: dict[str, _RobotTopics] = {}
         self._feed = pubsub.RobotFeed(session, keys)
         self._ranges = pubsub.Inbox(pubsub.subscriber(session, keys.ranges("*"), 256), messages.Ranges, keys=keys)
@@ -124,6 +126,8 @@ class Graph:
             self._diagnostics.put(self._types.make(ros2.DIAGNOSTIC_ARRAY, header=header, status=statuses))
         self._publish_states()
         self._publish_scans()
+        for sample in network.received(self._scenes.handler):
+            self._markers.send(sample.payload.to_bytes())
         for _, alive in self._centres.changes():
             self._centralised = alive
         for name, robot in self._robots.items():

@@ -31,6 +31,7 @@ BATTERY_STATE: Final = "sensor_msgs/msg/BatteryState"
 DIAGNOSTIC_ARRAY: Final = "diagnostic_msgs/msg/DiagnosticArray"
 TRANSFORM_STAMPED: Final = "geometry_msgs/msg/TransformStamped"
 TF_MESSAGE: Final = "tf2_msgs/msg/TFMessage"
+MARKER_ARRAY: Final = "visualization_msgs/msg/MarkerArray"
 
 STORES: Final[dict[Distro, str]] = {
     "humble": "ROS2_HUMBLE",

@@ -94,9 +94,12 @@ class WatchdogNode:
             self.node.get_logger().warning("no command: the robot is stopped")
 
     def stop(self) -> None:
-        """Stop a robot that moves, before the node ends."""
+        """Stop a robot that moves, before the node ends: with its writer, DDS drops what the robot has not read yet."""
         self.watchdog.hear(-1e9, moves=True)
-        self._check()
+        until = time.monotonic() + ZEROS_S
+        while time.monotonic() < until:
+            self._check()
+            time.sleep(CHECK_S)
 
 
 def wait_for_type(rclpy: Any, topic: str) -> str:

@@ -93,7 +93,7 @@ def _roles(plan: Plan, keys: Keys) -> dict[str, Grant]:
     observer = Grant(subscribe=everything, query=[keys.pose("*")], watch=everything)
     return {
         "observer": observer,
-        "recorder": Grant(subscribe=everything, watch=everything, tokens=[keys.recorder]),
+        "recorder": Grant(publish=[keys.scene], subscribe=everything, watch=everything, tokens=[keys.recorder]),
         "operator": Grant(
             publish=[keys.estop, keys.below("run")],
             subscribe=everything,
@@ -124,7 +124,7 @@ def _roles(plan: Plan, keys: Keys) -> dict[str, Grant]:
         ),
         "ros2": Grant(
             publish=[*goals, *foreign],
-            subscribe=[keys.state("*"), keys.ranges("*"), keys.status("*"), *foreign],
+            subscribe=[keys.state("*"), keys.ranges("*"), keys.status("*"), keys.scene, *foreign],
             tokens=tokens,
             watch=[keys.alive("*"), keys.centre_alive, *tokens],
         ),

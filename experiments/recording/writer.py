@@ -220,6 +220,7 @@ class Recording:
         clock: Literal["real", "virtual"],
         started: float | None = None,
         draw: Draw | None = None,
+        show: Callable[[bytes], object] | None = None,
         utc: Callable[[], float] | None = None,
         chunk_bytes: int = CHUNK_BYTES,
     ) -> None:
@@ -229,6 +230,7 @@ class Recording:
             path: A file that does not exist yet.
             started: UTC time of the common start [s], if it is known already; the event `start` says it as well.
             draw: Draws the scene for viewers.
+            show: Receives each of these drawings, a MarkerArray as CDR.
             utc: Clock of the recorder [s]: nothing is logged later than it came. Without one, messages come in order.
             chunk_bytes: Messages that are written together, and lost together by a kill [bytes].
         """
@@ -237,7 +239,7 @@ class Recording:
         self._schemas: dict[str, int] = {}
         self._stamp = -inf  # [s, UTC] the last good one
         self._latest = 0  # [ns] the same
-        self._utc, self._draw = utc, draw
+        self._utc, self._draw, self._show_scene = utc, draw, show
         self._places: dict[str, Vector] = {}  # [m] place of each robot, the last known
         self._framed: dict[str, float] = {}  # [s, UTC] stamp of its last transform, by robot
         self._scene_at = -inf  # [s, UTC]
@@ -320,6 +322,8 @@ class Recording:
                 self._scene_at = logged
                 drawn = viewers.markers(logged, self._draw(logged, self._places))
                 self._add(SCENES, state, drawn, logged)
+                if self._show_scene is not None:
+                    self._show_scene(drawn)
 
     def flush(self) -> None:
         """Brings everything so far to the disk."""

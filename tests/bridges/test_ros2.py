@@ -23,6 +23,7 @@ from agents.network.pubsub import alive_token, pose_publisher
 from agents.network.session import open_session, received
 from bridges.ros2 import messages as ros2
 from bridges.ros2.bridge import GoalHeight, main, ros_name, scan, transform
+from experiments.recording.ros2 import viewers
 from tests.commands import started
 from tests.waiting import until
 
@@ -266,6 +267,7 @@ def sides(router):
 def endpoints(*names, scan=False):
     """Endpoints of robots, and of the bridge."""
     found = [("MP", "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray"), ("MP", "/tf", ros2.TF_MESSAGE)]
+    found.append(("MP", "/scene", ros2.MARKER_ARRAY))
     for name in names:
         found.append(("MP", f"/{name}/pose", ros2.POSE_STAMPED))
         found.append(("MP", f"/{name}/velocity", ros2.TWIST_STAMPED))
@@ -307,6 +309,13 @@ def test_robots_are_in_the_graph_of_ros(sides):
     frame = node.taken(frames)[0][0].transforms[0]
     assert (frame.header.frame_id, frame.child_frame_id, frame.header.stamp.sec) == ("map", "CF01", 1700000000)
     assert (frame.transform.translation.x, frame.transform.rotation) == (1.0, turn)
+
+    drawing = viewers.markers(
+        1.7e9, [viewers.Marker("robots", viewers.CYLINDER, (0.1, 0.1, 0.1), (0, 114, 178), frame="CF01")]
+    )
+    scenes = node.subscribe("scene", ros2.MARKER_ARRAY)
+    (marker,) = node.taken(scenes, lambda: realm.session.put(realm.keys.scene, drawing))[0][0].markers
+    assert (marker.header.frame_id, marker.header.stamp.sec, marker.frame_locked) == ("CF01", 1700000000, True)
 
     swept = node.taken(scans, lambda: realm.ranges("CF01"))[0][0]
     assert (swept.header.frame_id, swept.ranges.tolist()) == ("CF01", [1.5, INF])

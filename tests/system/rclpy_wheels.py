@@ -11,9 +11,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-MESSAGES = ("geometry", "sensor", "nav", "diagnostic")
+MESSAGES = ("geometry", "sensor", "nav", "diagnostic", "visualization")
 WHEELS = ("ros-rclpy==9.1.2", "ros-rmw-fastrtps-cpp==9.3.3", *(f"ros-{name}-msgs==5.5.1" for name in MESSAGES))
-NAME = f"rclpy-9.1.2-cp{sys.version_info.major}{sys.version_info.minor}"
+NAME = f"rclpy-9.1.2-{len(WHEELS)}-cp{sys.version_info.major}{sys.version_info.minor}"
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "zenpark" / NAME
 PYTHON = CACHE / "ros" / "bin" / "python"
 REASON = CACHE / "reason.txt"  # why there is none; empty: it is complete

@@ -34,6 +34,7 @@ def test_one_command_runs_while_others_watch_and_stop(tmp_path):
     assert "park/CF01/state" in shown.stdout
     assert zenpark("echo", "park/*/pose", "-n", "3", *reach).stdout.count('"robot":') == 3
     assert "park/CF01/state" in zenpark("echo", "park/*/state", "--rates", "--seconds", "1", *reach).stdout
+    assert zenpark("echo", "park/run/scene", "-n", "1", *reach).stdout.endswith(" bytes, application/cdr>\n")
     zenpark("echo", "park/*/pose", "--seconds", "0.3", "--connect", endpoint, code=2)
     refused = zenpark("robot", "land", *reach, "--as", "observer", code=None)
     assert refused.stderr.count("no: no answer") == 3

@@ -11,15 +11,19 @@ import pytest
 from agents.network import messages
 from bridges.ros2 import messages as ros2
 from bridges.ros2.bridge import diagnostic, scan, transform
+from experiments.definition.plan import Plan
+from experiments.recording.ros2 import viewers
+from experiments.scene import markers
 from tests.commands import zenpark
 from tests.fuzz.targets_ros import ros_messages
+from tests.small import reference
 from tests.system.rclpy_wheels import APART, LOOPBACK, PYTHON, missing
 
 WHY = missing()
 pytestmark = [pytest.mark.system, pytest.mark.skipif(bool(WHY), reason=WHY)]
 SIDE = Path(__file__).with_name("rclpy_side.py")
 KINDS = {value for value in vars(ros2).values() if isinstance(value, str) and "/msg/" in value}
-PADDED = {ros2.ODOMETRY, ros2.DIAGNOSTIC_ARRAY}  # Fast CDR leaves padding undefined
+PADDED = {ros2.ODOMETRY, ros2.DIAGNOSTIC_ARRAY, ros2.MARKER_ARRAY}  # Fast CDR leaves padding undefined
 WITHOUT_WHEEL = {ros2.TF_MESSAGE}  # a list of TransformStamped; its hash is tested against the published one
 
 
@@ -50,7 +54,11 @@ def payloads():
         ros2.LASER_SCAN: scan(types, sweep, "tb3"),
         ros2.DIAGNOSTIC_ARRAY: types.make(ros2.DIAGNOSTIC_ARRAY, header=types.header(1.7e9, ""), status=[status] * 2),
     }
-    return ros_messages() | {kind: types.encode(message, kind) for kind, message in made.items()}
+    case = Plan(reference())
+    drawn = markers.drawing(case)(1.7e9, {name: (0.1 * k, 0.2, 0.3) for k, name in enumerate(case.names)})
+    assert {each.group for each in drawn} == {"arena", "robots", "names", "links"}
+    scene = {ros2.MARKER_ARRAY: viewers.markers(1.7e9, drawn)}
+    return ros_messages() | scene | {kind: types.encode(message, kind) for kind, message in made.items()}
 
 
 def test_types_and_cdr_are_those_of_rclpy(tmp_path):

@@ -34,6 +34,7 @@ FRESH_S: Final = 0.05  # largest time between a state and a true pose that belon
 PATIENCE_S: Final = 0.2  # longest wait of a state for the true pose after it
 TRUTHS: Final = 256  # kept, of each robot
 NAMED: Final = 100  # reported keys with unreadable messages
+CDR: Final = "application/cdr"
 
 
 class Recorder:
@@ -159,7 +160,15 @@ def record(launch: RecorderLaunch) -> int:
     with (
         joined(plan, endpoints, name="recorder", stop=asked, on_signal=asked.set, lost=lost) as joint,
         Recording(
-            target, plan, text, case=launch.name, seed=seed, clock="real", draw=markers.drawing(plan), utc=Clock().utc
+            target,
+            plan,
+            text,
+            case=launch.name,
+            seed=seed,
+            clock="real",
+            draw=markers.drawing(plan),
+            show=pubsub.publisher(joint.session, joint.keys.scene, CDR).put,
+            utc=Clock().utc,
         ) as recording,
     ):
         recorder = Recorder(joint.session, joint.keys, recording)
