@@ -24,7 +24,7 @@ robots.KH02 = { kind = "khepera4", body = "khepera4-twin", position = "external"
 def test_robots_drive_by_cameras(tmp_path):
     (tmp_path / "seen.toml").write_text(EXPERIMENT)
     bodies = {"KH01": (1, 0.2, 0.06, True), "KH02": (2, 0.2, 0.06, True)}
-    (tmp_path / "cameras.toml").write_text(text(bodies, "AC", 8.0, size=(800, 600), focal=560.0))
+    (tmp_path / "cameras.toml").write_text(text(bodies, "AC", 8.0, size=(800, 600), view_deg=71.08))
     flight = Flight(tmp_path / "run", tmp_path / "seen.toml", "--json")
     flight.until_flown()
     assert {"cameras", "cameras-twin"} <= flight.children().keys()

@@ -261,7 +261,20 @@ def calibrate(
     """Measure the lenses and the places of cameras, and write them into their file."""
     from importlib import import_module
 
-    import_module(CAMERAS).calibration().calibrate_file(file, again=lens, limit_s=limit)
+    import_module(CAMERAS).tool("calibrate").calibrate_file(file, again=lens, limit_s=limit)
+
+
+@cameras_app.command(epilog=example("cameras coverage cameras.toml --room 3.4 3.4 1.5"))
+def coverage(
+    file: Cameras,
+    *,
+    room: Annotated[tuple[float, float, float], Option(help="Sides along x and y, and height [m].")] = (3.0, 3.0, 1.5),
+) -> None:
+    """Print the places of a room in which cameras see the tags of robots, also before the cameras hang."""
+    from importlib import import_module
+
+    for line in import_module(CAMERAS).tool("coverage").report(file, room):
+        print(line)
 
 
 @cameras_app.command(name="print", epilog=example("cameras print cameras.toml tags.html"))
@@ -271,5 +284,5 @@ def print_sheets(
     """Write a page with the tags of a file and the board, to print in true size."""
     from importlib import import_module
 
-    import_module(CAMERAS).calibration().print_sheets(file, page)
+    import_module(CAMERAS).tool("calibrate").print_sheets(file, page)
     print(page)

@@ -26,12 +26,22 @@ class CamerasFileError(ExplainedError, ValueError):
     """A file of cameras that cannot be used, with place and remedy."""
 
 
+class PlannedCamera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Camera that does not hang yet, for its coverage."""
+
+    place: Triple  # position in the arena [m]
+    aim: Triple  # point in the middle of its image [m]
+    size: tuple[int, int] = (1280, 720)  # width and height of its images [px]
+    view_deg: Annotated[float, Meta(gt=0, le=150)] = 78.0  # horizontal field of view [degrees]
+
+
 class CameraTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Camera of the lab."""
 
     # http://HOST[:PORT]/PATH with a stream of JPEG, /dev/video0, a video file
     source: Annotated[str, Meta(pattern=r"^(http://\S+|[^:]+)$")]
     latency_s: NotNegative = 0.0  # age of its images on arrival, where they bring no time of exposure [s]
+    planned: PlannedCamera | None = None
 
 
 class FloorTags(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -26,10 +26,10 @@ class MissingLibraryError(ExplainedError):
     """OpenCV is not installed."""
 
 
-def calibration() -> ModuleType:
-    """The module `calibrate`; raises MissingLibraryError without OpenCV."""
+def tool(name: str) -> ModuleType:
+    """The module `calibrate` or `coverage`; raises MissingLibraryError without OpenCV."""
     try:
-        return import_module("bridges.motion_capture.cameras.calibrate")
+        return import_module(f"bridges.motion_capture.cameras.{name}")
     except ImportError as error:
         raise MissingLibraryError(NEEDED) from error
 

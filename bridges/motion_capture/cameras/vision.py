@@ -24,6 +24,7 @@ WRONG_PX: Final = 2.5  # largest mean error of a pose in the images: views of tw
 UPRIGHT: Final = 0.5  # least cosine of a tag's tilt
 LEAST: Final = 0.03  # least perimeter of a tag as a share of an image's width
 BOX: Final = 0.5  # likewise in a box: noise has thousands of small squares
+ENLARGED_PX: Final = 60.0  # boxes of a smaller half side are enlarged twice: at 12 px three times as many tags are seen
 
 
 def square(size: float, x: float = 0.0, y: float = 0.0, yaw: float = 0.0) -> Array:
@@ -125,8 +126,11 @@ class TagDetector:
         settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_CONTOUR
         # two thresholds instead of three: 98 % of the tags in half of the time
         settings.adaptiveThreshWinSizeMin, settings.adaptiveThreshWinSizeMax = 5, 15
+        settings.perspectiveRemovePixelPerCell = 8
         settings.minMarkerPerimeterRate = BOX
+        settings.errorCorrectionRate = 1.0  # 5 of 36 bits; in whole images too many squares would pass for a tag
         self._box = cv2.aruco.ArucoDetector(family, settings)
+        settings.errorCorrectionRate = 0.6
         settings.minMarkerPerimeterRate = LEAST
         settings.adaptiveThreshConstant = 10  # noise is no edge
         self._whole = cv2.aruco.ArucoDetector(family, settings)
@@ -146,9 +150,11 @@ class TagDetector:
             part = grey[top:bottom, left:right]
             if min(part.shape) < 16:
                 continue
-            for each, corners in self._find(self._box, np.ascontiguousarray(part)):
+            scale = 2 if half < ENLARGED_PX else 1
+            enlarged = cv2.resize(part, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+            for each, corners in self._find(self._box, enlarged):
                 if each == number:
-                    seen[number] = corners + np.array([left, top])
+                    seen[number] = (corners + 0.5) / scale - 0.5 + np.array([left, top])
         return seen
 
     def _find(self, detector: Any, grey: Array) -> Iterable[tuple[int, Array]]:  # noqa: ANN401 - of OpenCV

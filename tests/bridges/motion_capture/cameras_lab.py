@@ -1,11 +1,10 @@
 """A lab with cameras in its corners, for tests: its file, its truth, and images of it."""
 
-import cv2
 import msgspec
 import numpy as np
 
-from bridges.motion_capture.cameras import file
-from bridges.motion_capture.cameras.file import MeasuredCamera
+from bridges.motion_capture.cameras import coverage, file
+from bridges.motion_capture.cameras.file import PlannedCamera
 from bridges.motion_capture.cameras.vision import FLAT, CameraModel, square
 from bridges.motion_capture.twin.cameras import CameraImages, sheet
 
@@ -13,15 +12,10 @@ CORNERS = {"A": (-1.7, -1.7, 2.6), "C": (1.7, 1.7, 2.6), "B": (1.7, -1.5, 2.6), 
 FLOOR = {20: (-1.2, -1.2), 21: (1.2, -1.2), 22: (1.2, 1.2), 23: (-1.2, 1.2), 24: (0.0, -1.2), 25: (0.0, 1.2)}
 
 
-def hung(place, at=(0.0, 0.0, 0.3), size=(1280, 720), focal=720.0):
-    """A camera at `place` that looks at `at`, with a lens that bends straight lines."""
-    ahead = np.subtract(at, place) / np.linalg.norm(np.subtract(at, place))
-    right = np.cross(ahead, (0.0, 0.0, 1.0))
-    right /= np.linalg.norm(right)
-    turn = cv2.Rodrigues(np.stack([right, np.cross(ahead, right), ahead]))[0].ravel().tolist()
-    width, height = size
-    lens = (-0.08, 0.01, 0.0, 0.0, 0.0)
-    return MeasuredCamera(size, (focal, focal, width / 2, height / 2), lens, tuple(map(float, place)), tuple(turn))
+def hung(place, aim=(0.0, 0.0, 0.3), size=(1280, 720), view_deg=83.27):
+    """A camera at `place` that looks at `aim`, with a lens that bends straight lines."""
+    straight = coverage.hung(PlannedCamera(place, aim, size, view_deg))
+    return msgspec.structs.replace(straight, lens=(-0.08, 0.01, 0.0, 0.0, 0.0))
 
 
 def text(bodies, cameras="ABCD", rate_hz=10.0, **settings):
