@@ -170,12 +170,12 @@ class Robot:
         A robot that was ordered to hold before goes on to hold: the order to begin comes by itself in a run.
         `origin`: x, y, z [m] and yaw [rad] at which the plan of a restarted robot began; None: the plan restarts.
         """
-        waits = self.lifecycle.phase == AIRBORNE
+        airborne = self.lifecycle.phase == AIRBORNE
         refusal = self.lifecycle.start(at)
         if not refusal:
-            if not (waits and self._ordered):
+            if not (airborne and self._ordered):
                 self.resume()
-            if origin is not None and waits:
+            if origin is not None and airborne:
                 self._begin_plan(origin, t - at)
         return refusal
 
@@ -228,7 +228,7 @@ class Robot:
         self.take(t, state)
         if not self.is_steady(t):
             self.live(t)
-        return self.question(t)
+        return self.transmission_due(t)
 
     def take(self, t: float, state: BodyState) -> None:
         """Take the state of the body at `t` [s]."""
@@ -292,16 +292,16 @@ class Robot:
             # 0, unless it joins a run under way
             self.begun, self.tick = True, round((t - life.start_at) * self.assignment.body_hz)
 
-    def question(self, t: float) -> bool:
+    def transmission_due(self, t: float) -> bool:
         """Whether the robot transmits its pose now; quiet."""
         # by number, not by remainder: a decision due on a skipped tick is made on the next one
-        decision, question = self.tick // self._decide_every, self.tick // self._pose_every
+        decision, pose = self.tick // self._decide_every, self.tick // self._pose_every
         self.decision_due, self._decided = decision != self._decided, decision
         if self._stepping is not None and self.decision_due:
             self._step(t, self._stepping)
-        if question == self._asked:
+        if pose == self._asked:
             return False
-        self._asked = question
+        self._asked = pose
         goals, transmitter, now = self.goals, self.transmitter, self.now
         goals.errors(t, now.position)
         self.error = nan if now.invalid else goals.error
@@ -445,8 +445,8 @@ class Robot:
         if assignment.patience_s is None or t <= assignment.patience_s:
             lacks = self.neighbours.unreceived() or (self.guidance is not None and self.guidance.missing)
         missing = self.missing_neighbours() if lacks else []
-        waits = self._ordered and not life.climbing
-        failing = PAUSED if waits else self._preflight.check(self.now, missing, self.neighbours, self.health)
+        paused = self._ordered and not life.climbing
+        failing = PAUSED if paused else self._preflight.check(self.now, missing, self.neighbours, self.health)
         life.failing, lost = failing, self._preflight.lost(t, failing)
         if failing:
             life.set_missing(failing)

@@ -29,6 +29,8 @@ DEPENDENT = re.compile(
     r"during)\b",
     re.IGNORECASE,
 )
+# names of values that are pronouns or participles
+PRONOUNS = {"mine", "ours", "theirs", "its", "whose", "those", "there", "told", "waits", "unknown"}
 FENCE = re.compile(r"^ *(```|~~~).*?^ *\1|^(?: {4,}[^\n]*\n)+", re.MULTILINE | re.DOTALL)
 COMMENT = re.compile(r"(?:^|(?<=\s))#.*")  # in a text of several lines, what looks like one as well
 ITEM = re.compile(r"\n\s*\n|\n(?=\s*(?:[-*|>#]|\d+\.|`?\w[\w., ]*`?:) )")
@@ -109,7 +111,31 @@ def crowded(node: ast.AST) -> bool:
     return isinstance(target, ast.Tuple) and len(target.elts) > 2 and len({*map(form, node.value.elts)}) > 1
 
 
-@pytest.mark.parametrize("place", [place for place in PLACES if (ROOT / place / "__init__.py").exists()])
+def names(node: ast.AST) -> str:
+    """Name that a node gives to a value, a function or a class, without underscores around it; empty for others."""
+    match node:
+        case ast.Name(id=name, ctx=ast.Store()) | ast.Attribute(attr=name, ctx=ast.Store()) | ast.arg(arg=name):
+            return name.strip("_")
+        case ast.FunctionDef(name=name) | ast.ClassDef(name=name):
+            return name.strip("_")
+    return ""
+
+
+CODE = pytest.mark.parametrize("place", [place for place in PLACES if (ROOT / place / "__init__.py").exists()])
+
+
+@CODE
+def test_names_are_nouns(place):
+    found = [
+        f"{file}:{node.lineno}: {names(node)}"
+        for file in sorted((ROOT / place).rglob("*.py"))
+        for node in ast.walk(ast.parse(file.read_text("utf-8")))
+        if names(node) in PRONOUNS
+    ]
+    assert not found, "\n".join(found)
+
+
+@CODE
 def test_lines_are_read_at_one_glance(place):
     found = []
     for file in sorted((ROOT / place).rglob("*.py")):

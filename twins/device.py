@@ -87,7 +87,7 @@ class Capture:
         self._past: deque[tuple[float, Array, Array]] = deque()  # time [s], positions, attitudes
         self._stuck: Array | None = None  # position (3,) [m]
 
-    def told(self, faults: Faults, t: float, position: Array, attitude: Array) -> tuple[Array, Array, Array]:
+    def measured(self, faults: Faults, t: float, position: Array, attitude: Array) -> tuple[Array, Array, Array]:
         """Positions (n, 3) [m], attitudes (n, ...), and yaws (n,) [rad] by which these are turned, at time `t` [s].
 
         Called for each frame, also without a fault, with arrays that are not changed afterwards.

@@ -210,6 +210,6 @@ def _disjoint(polygon: Array, low: Array, high: Array) -> bool:
     edge = np.roll(polygon, -1, axis=0) - polygon
     axes = np.concatenate([np.eye(2), np.stack([-edge[:, 1], edge[:, 0]], axis=1)])
     rectangle = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]])
-    mine, other = polygon @ axes.T, rectangle @ axes.T
-    gap = np.maximum(other.min(axis=0) - mine.max(axis=0), mine.min(axis=0) - other.max(axis=0))
+    shadow, other = polygon @ axes.T, rectangle @ axes.T
+    gap = np.maximum(other.min(axis=0) - shadow.max(axis=0), shadow.min(axis=0) - other.max(axis=0))
     return bool((gap > 0.0).any())

@@ -57,8 +57,8 @@ class Claims:
                 for key, own in device.lock_keys(hosts):
                     mode = fcntl.LOCK_EX if own else fcntl.LOCK_SH
                     file = f"device-{hashlib.sha256(key.encode()).hexdigest()[:32]}.lock"
-                    there = [each / file for each in foreign_folders() if (each / file).is_file()]
-                    for path in [*(each / file for each in runtime_folders()), *there]:
+                    found = [each / file for each in foreign_folders() if (each / file).is_file()]
+                    for path in [*(each / file for each in runtime_folders()), *found]:
                         self._locks.append((path, _lock(path, name, device.address, mode)))
             except OSError as error:
                 self.release()

@@ -79,7 +79,7 @@ def assemble(request: BodyRequest) -> Body:
     parts: list[tuple[list[int], Body]] = []
     for name in dict.fromkeys(names):
         group = [row for row, other in enumerate(names) if other == name]
-        body, its = registry.load(registry.BODIES, name), request.select(group)
-        refuse(body, its)
-        parts.append((group, body(its)))
+        body, part = registry.load(registry.BODIES, name), request.select(group)
+        refuse(body, part)
+        parts.append((group, body(part)))
     return Fleet(parts) if len(parts) > 1 else parts[0][1]

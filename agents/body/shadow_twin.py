@@ -72,11 +72,11 @@ class Shadowed(Body):
 
     def command(self, setpoints: Sequence[Setpoint]) -> None:
         self._body.command(setpoints)
-        mine = [setpoints[row] for row in self._rows]
-        for k, setpoint in enumerate(mine):
+        shadowed = [setpoints[row] for row in self._rows]
+        for k, setpoint in enumerate(shadowed):
             if all(map(isfinite, setpoint)) and any(setpoint):
                 self._driven[k] = True
-        self._try(lambda twin: twin.command(mine))
+        self._try(lambda twin: twin.command(shadowed))
 
     def takeoff(self, rows: Sequence[int], heights: Sequence[float]) -> None:
         self._body.takeoff(rows, heights)
@@ -134,10 +134,10 @@ class Shadowed(Body):
 
     def _twin_rows(self, rows: Sequence[int]) -> list[int]:
         """Robots of the twin for `rows` of the body, as their motors switch on or off."""
-        mine = [self._rows.index(row) for row in rows if row in self._rows]
-        for k in mine:
+        twin_rows = [self._rows.index(row) for row in rows if row in self._rows]
+        for k in twin_rows:
             self._driven[k], self._due[k] = False, -inf
-        return mine
+        return twin_rows
 
     def _try(self, act: Callable[[Placeable], None]) -> None:
         twin = self._twin

@@ -130,8 +130,8 @@ class Centre:
             begun = phase[row] == AIRBORNE and t >= start[row] - ROUNDING_S
             runs = known and (begun or phase[row] == RUNNING)
             any_runs = any_runs or runs
-            waits = known and not runs and phase[row] <= AIRBORNE and self._complete(row, t)
-            if (goal := self._goal_of(row, t, start[row], runs=runs, waits=waits)) is not None:
+            hovers = known and not runs and phase[row] <= AIRBORNE and self._complete(row, t)
+            if (goal := self._goal_of(row, t, start[row], runs=runs, hovers=hovers)) is not None:
                 found.append(goal)
         self.decisions += any_runs
         self._exchange_words()
@@ -158,7 +158,7 @@ class Centre:
         if stepping.speech is not None:
             robot.computer.step(t, position, robot.velocity, robot.yaw, start)
 
-    def _goal_of(self, row: int, t: float, start: float, *, runs: bool, waits: bool) -> CentreGoal | None:
+    def _goal_of(self, row: int, t: float, start: float, *, runs: bool, hovers: bool) -> CentreGoal | None:
         robot, assignment = self.robots[row], self.assignments[row]
         computer, new = robot.computer, False
         velocity = UNKNOWN
@@ -176,7 +176,7 @@ class Centre:
                     return None  # a robot without goals holds
                 if computer.follows and not computer.stepping.gives_goal:
                     velocity = computer.stepping.velocity
-        held = (runs and computer.without_neighbours()) or waits
+        held = (runs and computer.without_neighbours()) or hovers
         robot.keeping.hold(held, position)
         if held:
             robot.goal = robot.keeping.at

@@ -73,7 +73,7 @@ class Lifecycle:
         self.moved = False  # whether the phase changed on the last tick, or by an order since the one before
         # commands that the body has not received yet
         self.takeoff_due = self.land_due = self.stop_due = False
-        self.reason = self._waits = ""  # why it is not ready, or has landed
+        self.reason = self._obstacle = ""  # why it is not ready, or has landed
         self.failing = ""  # check that fails on this tick, though the robot may be ready; empty: none
 
     def takeoff(self) -> str:
@@ -114,7 +114,7 @@ class Lifecycle:
 
     def set_missing(self, reason: str) -> None:
         """Store why an idle robot is not ready, or why a ready one will not be any more on this tick."""
-        self._waits = reason
+        self._obstacle = reason
         if self.phase == IDLE:
             self.reason = reason
 
@@ -166,7 +166,7 @@ class Lifecycle:
         if self.phase == IDLE and ready:
             self.phase, self.reason = READY, ""
         elif self.phase == READY and not (ready or self.climbing):
-            self.phase, self.reason = IDLE, self._waits
+            self.phase, self.reason = IDLE, self._obstacle
         if self.climbing and not self.takeoff_due and self._is_up(position, velocity):
             self.phase, self.climbing = AIRBORNE, False
         if self.phase == AIRBORNE and t >= self.start_at - 1e-6:

@@ -109,7 +109,7 @@ class Keys:
         before, _, session = token.rpartition("/")
         return session if before.endswith("/life") or before.rpartition("/")[0].endswith("/claim") else None
 
-    def whose(self, key: str) -> str | None:
+    def robot_of(self, key: str) -> str | None:
         """The robot of `<realm>/<robot>/<what>`; None for any other key, as that of a PUT on many at once (`**`)."""
         realm, _, rest = key.partition("/")
         robot, _, what = rest.partition("/")

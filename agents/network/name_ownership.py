@@ -65,12 +65,12 @@ def claim(
     given `vanish_s` to vanish. Raises network.Unreachable without an answer in `answer_s`, or when `stop` is set.
     """
     pause = stop or threading.Event()
-    mine = str(session.zid())
-    rank = Keys.rank(began, mine)
+    own_id = str(session.zid())
+    rank = Keys.rank(began, own_id)
 
     def stands_in_the_way(key: str, token: str, owners: bool) -> bool:
         other = Keys.rank_of(key, token)
-        return other < rank if other is not None else owners and token != Keys.life(key, mine)
+        return other < rank if other is not None else owners and token != Keys.life(key, own_id)
 
     def rivals(*, owners: bool) -> list[str]:
         """Names with an earlier claim, or with another owner if `owners` count."""
@@ -102,7 +102,7 @@ def claim(
             if time.monotonic() > deadline:
                 raise NameTaken(", ".join(others))
             pause.wait(timing.retry_s)
-        tokens += [pubsub.alive_token(session, Keys.life(key, mine)) for key in alive]
+        tokens += [pubsub.alive_token(session, Keys.life(key, own_id)) for key in alive]
         pause.wait(settle_s)
         if others := rivals(owners=False):
             raise NameTaken(", ".join(others))
@@ -143,7 +143,7 @@ def confirm_ownership(
     Raises NameTaken if another process owns one of the names, and network.Unreachable if `pause` was set before that
     was known; without a router the wait has no limit.
     """
-    mine = str(session.zid())
+    own_id = str(session.zid())
     free = taken = inf
     while not pause.is_set():
         linked = network.connected(session)
@@ -155,7 +155,7 @@ def confirm_ownership(
         elif others := [
             key
             for key, tokens in zip(alive, found, strict=True)
-            if any(Keys.life_of(token) not in (None, mine) for token in tokens or ())
+            if any(Keys.life_of(token) not in (None, own_id) for token in tokens or ())
         ]:
             free, taken = inf, min(taken, now)
             note(True)
@@ -302,4 +302,4 @@ class NameKeeper:
             token.undeclare()
 
     def _owners_text(self, taken: NameTaken) -> str:
-        return ", ".join(self._keys.whose(token) or token for token in str(taken).split(", "))
+        return ", ".join(self._keys.robot_of(token) or token for token in str(taken).split(", "))

@@ -237,7 +237,7 @@ class Inbox(Generic[M]):
         # the next queued sample, or None; Zenoh makes a new handler at each access
         self.take = subscription.handler.try_recv
         self._robots = robots
-        self._key, self._owner = "", None if keys is None else keys.whose("")  # last key: mostly the next's
+        self._key, self._owner = "", None if keys is None else keys.robot_of("")  # last key: mostly the next's
         self.malformed, self.trouble = 0, ""  # refused payloads, and the reason of the last refusal
 
     def read(self, check: Callable[[M], object] | None = None) -> Iterator[M]:
@@ -266,7 +266,7 @@ class Inbox(Generic[M]):
             if wanted is not None and not wanted(key):
                 continue
             if key != self._key and self._keys is not None:
-                self._key, self._owner = key, self._keys.whose(key)
+                self._key, self._owner = key, self._keys.robot_of(key)
             try:
                 message = messages.decode(sample.payload.to_bytes(), str(sample.encoding), self._kind)
                 if self._keys is not None and (robot := getattr(message, "robot", "")) != self._owner:
@@ -492,6 +492,6 @@ class RobotFeed:
 
     def alive(self) -> Iterator[tuple[str, bool]]:
         """Name of each robot that came (True) or went (False) since the last call, oldest first."""
-        for token, there in self._tokens.changes():
-            if (robot := self._keys.whose(token)) is not None:
-                yield robot, there
+        for token, stands in self._tokens.changes():
+            if (robot := self._keys.robot_of(token)) is not None:
+                yield robot, stands

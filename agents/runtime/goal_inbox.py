@@ -52,12 +52,12 @@ class GoalInbox:
 
     def receive(self, t: float, utc: float) -> None:
         """Receives all until `t` [s] of a clock that was 0 at `utc`."""
-        for token, there in self._watch.changes():
+        for token, stands in self._watch.changes():
             if token != self._centre:
-                self._begin(Keys.life_of(token), there=there)
-            elif there or network.connected(self._session):  # tokens vanish without a router, too: proves nothing
+                self._begin(Keys.life_of(token), stands=stands)
+            elif stands or network.connected(self._session):  # tokens vanish without a router, too: proves nothing
                 for guidance in self._guidance.values():
-                    guidance.mark_alive() if there else guidance.mark_lost(t)
+                    guidance.mark_alive() if stands else guidance.mark_lost(t)
         for row, inbox in self._inboxes.items():
             for goal, sample in inbox.read_samples(partial(self._check, row, utc + t)):
                 self._seq[row] = goal.seq
@@ -70,9 +70,9 @@ class GoalInbox:
             if self._guidance[row].receive(goal.position, yaw, stamp, (x, y, z)):
                 self.unreported[row].append(messages.GoalReceipt(goal.seq, goal.stamp, goal.pose, utc + t))
 
-    def _begin(self, life: str | None, *, there: bool) -> None:
+    def _begin(self, life: str | None, *, stands: bool) -> None:
         """Resets the numbers for a new central controller: its clock may be behind that of the former one."""
-        if life is None or not there or life == self._life:
+        if life is None or not stands or life == self._life:
             return
         if self._life:
             self._seq = dict.fromkeys(self._seq, 0)

@@ -187,8 +187,8 @@ class Runtime:
             on_start=self._align,
         )  # fmt: skip
         self._conductor = pubsub.AliveWatch(session, keys.conductor)
-        located = [row for row, there in enumerate(self._setup.externally_measured) if there]
-        exact = [row for row, there in enumerate(self._setup.exact) if there]
+        located = [row for row, marked in enumerate(self._setup.externally_measured) if marked]
+        exact = [row for row, marked in enumerate(self._setup.exact) if marked]
         silence_s = self._limits.position_timeout_s
         late_s = [robot.assignment.limits.late_s for robot in self.robots]
         self._located = (
@@ -309,8 +309,8 @@ class Runtime:
         health = self.health
         if t >= self._router_due:  # a check of the router costs as much as a law
             health.offline_since = self._cut_off_since(t)
-        for _, there in self._conductor.changes() if self._conductor.waiting else ():
-            health.conductor_lost_since = inf if there else min(health.conductor_lost_since, t)
+        for _, stands in self._conductor.changes() if self._conductor.waiting else ():
+            health.conductor_lost_since = inf if stands else min(health.conductor_lost_since, t)
         self._neighbours.deliver(t, self._utc)
         if self._goals is not None:
             self._goals.receive(t, self._utc)

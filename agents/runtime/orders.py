@@ -68,7 +68,7 @@ class OrderDesk:
 
     def _obey(self, row: int, order: Order, t: float, utc: float, states: Sequence[BodyState]) -> messages.Reply:
         robot = self._robots[row]
-        waits = robot.lifecycle.phase == Phase.AIRBORNE
+        airborne = robot.lifecycle.phase == Phase.AIRBORNE
         slept = robot.health.suspended_s
         # the conductor has given up waiting
         if order.order == "takeoff" and slept > ASK_S and robot.health.just_resumed(t):
@@ -78,7 +78,8 @@ class OrderDesk:
         self._counts.refused += bool(refusal)
         if order.order == "leave":
             self.leaving.add(row)
-        if order.order == "start" and order.at is not None and not refusal and waits:  # a running robot keeps its ticks
+        # a running robot keeps its ticks
+        if order.order == "start" and order.at is not None and not refusal and airborne:
             self._on_start(order.at - utc, t)
         phase = Phase(robot.lifecycle.phase).word
         found = self._inspect(row, t, states) if order.order == "inspect" else None

@@ -130,14 +130,14 @@ class NeighbourSubscription:
 
     def token_changes(self) -> Iterator[TokenChange]:
         """Changes of the liveliness of the robot, oldest first."""
-        for token, there in self._alive.changes():
+        for token, stands in self._alive.changes():
             if token == self._token:
-                if there and self.alive is False and self._order.return_token():
+                if stands and self.alive is False and self._order.return_token():
                     yield "new session"
-                self.alive = there
+                self.alive = stands
                 self._refusals, self.doubt = 0, ""
-                yield "appeared" if there else "vanished"
-            elif (session := Keys.life_of(token)) is not None and self._order.note_life(session, there=there):
+                yield "appeared" if stands else "vanished"
+            elif (session := Keys.life_of(token)) is not None and self._order.note_life(session, stands=stands):
                 yield "new session"
 
     def _detect_lag(self, now: float, age: float) -> None:
@@ -189,8 +189,8 @@ class ModelledInbox:
         self._knowledge, self._channel = knowledge, Channel(conditions)
         self._counted = counted
         self.senders = [
-            NeighbourSubscription(session, keys, name, mine, valid_box=valid_box, rate=rate, depth=depth, bell=bell)
-            for name, mine in links.items()
+            NeighbourSubscription(session, keys, name, effects, valid_box=valid_box, rate=rate, depth=depth, bell=bell)
+            for name, effects in links.items()
         ]
         self.arrived = 0  # poses before the modelled channel, without those of robots of this process
         self.changed = False  # a sender appeared or vanished since the caller reset this

@@ -23,9 +23,9 @@ class PoseOrder:
         self._named = False  # True if that session had a life token
         self._lives: list[str] = []  # sessions with a life token, the first one first
 
-    def note_life(self, session: str, *, there: bool) -> bool:
+    def note_life(self, session: str, *, stands: bool) -> bool:
         """The life token of `session` appeared, or vanished; returns whether the robot has a new session."""
-        self._lives = [life for life in self._lives if life != session] + ([session] if there else [])
+        self._lives = [life for life in self._lives if life != session] + ([session] if stands else [])
         if not self._lives:
             return False
         known, self._named = self._named or self.seq > 0, True

@@ -157,7 +157,7 @@ class Guard:
         self._session, self._read, self._rights = session, read, rights
         self._known = read()
         self._keys = Keys(rights.realm)
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         self._clock = Clock()
         self._hazards: deque[str] = deque()  # not published yet
         self._links: dict[str, list[zenoh.Link]] = {}  # links of each certificate
@@ -197,7 +197,7 @@ class Guard:
 
     def _check_token(self, sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)
-        owner = self._keys.whose(key) or ""
+        owner = self._keys.robot_of(key) or ""
         if sample.kind == zenoh.SampleKind.DELETE:
             self._tokens[owner] -= 1
             return
@@ -218,8 +218,8 @@ class Guard:
     def _disconnect(self, link: zenoh.Link, what: str) -> None:
         done = "is disconnected" if hang_up_on(link) else "cannot be disconnected, only TLS can: revoke the certificate"
         text = f"a session with the certificate of {link.auth_identifier} {what}; it {done}"
-        if text not in self._told:
-            self._told.add(text)
+        if text not in self._reported:
+            self._reported.add(text)
             self._hazards.append(text)
             print(f"router: {text}", file=sys.stderr, flush=True)
 
@@ -245,13 +245,13 @@ class StuckCheck:
         self._over = threading.Event()
 
     def start(self) -> None:
-        for each in (self._question, self._watch):
+        for each in (self._ask_on, self._watch):
             threading.Thread(target=each, name="stuck", daemon=True).start()
 
     def end(self) -> None:
         self._over.set()
 
-    def _question(self) -> None:
+    def _ask_on(self) -> None:
         while not self._over.wait(LOOK_AGAIN_S):
             self._asked += 1
             if self._ask():

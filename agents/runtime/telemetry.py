@@ -84,7 +84,8 @@ class TelemetryPublisher:
         self._receipts = [deque[messages.GoalReceipt]() for _ in names] if receipts is None else receipts
         self._seq = 0
         self._scanned = [-inf] * len(names)
-        self._told: list[tuple[object, float]] = [(None, -inf)] * len(names)  # memories sent last, and when [s]
+        # memories sent last, and when [s]
+        self._sent_memories: list[tuple[object, float]] = [(None, -inf)] * len(names)
         self._origin: list[messages.Setpoint | None] = [None] * len(names)
         self._last: list[messages.Status | None] = [None] * len(names)
         self._reported: list[tuple[object, ...]] = [()] * len(names)
@@ -128,10 +129,10 @@ class TelemetryPublisher:
 
     def _send_memory(self, row: int, stepping: Stepping, t: float) -> None:
         """Send what the law remembers as soon as it has stepped, and else once in the time of a step."""
-        publisher, (last, sent_at) = self._memories[row], self._told[row]
+        publisher, (last, sent_at) = self._memories[row], self._sent_memories[row]
         if publisher is None or (stepping.memory is last and t - sent_at < stepping.facts.step_s - ROUNDING_S):
             return
-        self._told[row] = stepping.memory, t
+        self._sent_memories[row] = stepping.memory, t
         memory = messages.memory(self._names[row], self._seq, self.utc + t, stepping.memory, stepping.measures)
         publisher.put(messages.encode(memory, self._encoding))
 
@@ -179,7 +180,7 @@ class TelemetryPublisher:
 
     def _status(self, row: int, t: float, missing: list[str], state: BodyState | None) -> messages.Status:
         robot, counts = self._robots[row], self._counts
-        life, mine = robot.lifecycle, self._neighbours.senders_of(row)
+        life, senders = robot.lifecycle, self._neighbours.senders_of(row)
         if self._origin[row] is None and state is not None and life.phase == Phase.RUNNING:
             x, y, z = robot.now.position
             self._origin[row] = (x, y, z, state.yaw) if isfinite(x + y + z) else None
@@ -192,10 +193,10 @@ class TelemetryPublisher:
             battery=None if state is None else messages.number(state.battery),
             sent=counts.sent[row],
             received=self._neighbours.received[row],
-            lost={sender.name: sender.lost for sender in mine},
+            lost={sender.name: sender.lost for sender in senders},
             dropped=self._neighbours.dropped_of(row),
-            stale={sender.name: sender.stale for sender in mine if sender.stale},
-            foreign={sender.name: sender.foreign for sender in mine if sender.foreign},
+            stale={sender.name: sender.stale for sender in senders if sender.stale},
+            foreign={sender.name: sender.foreign for sender in senders if sender.foreign},
             malformed=self._malformed() + self._neighbours.malformed,
             refused=counts.refused,
             ticks=counts.ticks,

@@ -232,10 +232,10 @@ class Detector:
         found = 0
         if health.just_resumed(t):
             # no new pose of an alive neighbour yet, or no new goal
-            waits = -inf < status.goal_stamp < health.resumed_at
+            outdated = -inf < status.goal_stamp < health.resumed_at
             for sender in neighbours.all:
-                waits = waits or (-inf < sender.stamp < health.resumed_at and not isfinite(sender.lost_since))
-            if waits:
+                outdated = outdated or (-inf < sender.stamp < health.resumed_at and not isfinite(sender.lost_since))
+            if outdated:
                 found |= 1 << Cause.SUSPENDED
         if health.offline_since < inf:
             found |= 1 << Cause.ROUTER

@@ -66,12 +66,12 @@ class Continuity:
             plausible_turn += self._turn_rate * since
         turn = abs((yaw - self._yaw + pi) % tau - pi) if self._wheels and isfinite(yaw) else nan  # NaN: none before
         turned = watched and turn > plausible_turn
-        unknown = watched and (isnan(position[0]) or isnan(position[1]) or isnan(position[2]))
+        blind = watched and (isnan(position[0]) or isnan(position[1]) or isnan(position[2]))
         self.yaw_jump = turn if turned else nan
-        self.jumped = turned or (watched and (gap > plausible or (unknown and self.jumped)))
+        self.jumped = turned or (watched and (gap > plausible or (blind and self.jumped)))
         if self._wheels and not self.jumped and (isfinite(yaw) or not watched):
             self._yaw = yaw
-        if not (self.jumped or unknown):
+        if not (self.jumped or blind):
             self._place, self._time = position, time
         return gap if self.jumped else nan
 

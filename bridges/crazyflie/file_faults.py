@@ -72,11 +72,10 @@ def _radios(robots: Sequence[BodyEntry]) -> Iterator[BodyFault]:
     for each in robots:
         radio = dongle_of(each.address)
         other = first.setdefault((each.host, radio), each)
-        air, its = air_of(each.address), air_of(other.address)
-        if air != its:
-            message = (
-                f"radio {radio} has {each.name} on channel {air[0]}, {air[1]}, and {other.name} on {its[0]}, {its[1]}"
-            )
+        air, other_air = air_of(each.address), air_of(other.address)
+        if air != other_air:
+            channel = f"{each.name} on channel {air[0]}, {air[1]}"
+            message = f"radio {radio} has {channel}, and {other.name} on {other_air[0]}, {other_air[1]}"
             yield BodyFault(each.name, BODY, message, "give all drones of a radio one channel and data rate")
         elif each.process != other.process:
             message = f"{other.name} and {each.name} share radio {radio}, which one process drives"

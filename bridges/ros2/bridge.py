@@ -137,8 +137,8 @@ class Graph:
     def _update_robots(self) -> list[Message]:
         """Add and remove robots by their liveliness tokens; returns the diagnostics of the removed ones."""
         gone = []
-        for name, there in self._feed.alive():
-            if not there:
+        for name, stands in self._feed.alive():
+            if not stands:
                 if (robot := self._robots.pop(name, None)) is not None:
                     robot.close()
                     gone.append(diagnostic(self._types, name, ERROR, "gone", {}))

@@ -270,8 +270,8 @@ class TelloPilot:
         if self.duty is Duty.HOLD and math.isfinite(self.position[0]):
             limit, response = self._kind.speed, self._kind.response
             x, y, z = (
-                max(-limit, min(limit, response * (there - here)))
-                for there, here in zip(self.hold_position, self.position, strict=True)
+                max(-limit, min(limit, response * (hold - here)))
+                for hold, here in zip(self.hold_position, self.position, strict=True)
             )
             return protocol.sticks((x, y, z), 0.0, self.yaw, scale)
         return ZERO_STICKS

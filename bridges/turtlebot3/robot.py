@@ -191,13 +191,13 @@ class TurtleBotConnection:
             return "no router"
         if fault := self.odometry.fault(now):
             return fault
-        mine = (self._command_type, self._types.hash(self._command_type) if self.address.style == "rmw" else "")
+        sent_type = (self._command_type, self._types.hash(self._command_type) if self.address.style == "rmw" else "")
         types = set(self._command_receivers.values())
-        if types and mine not in types:
+        if types and sent_type not in types:
             other, code = sorted(types)[0]
-            expected = f"the robot expects a {other}" if other != mine[0] else f"its type hash is {code}"
+            expected = f"the robot expects a {other}" if other != sent_type[0] else f"its type hash is {code}"
             return (
-                f"cmd_vel is not received: {expected}, we send a {mine[0]} as on {self.address.distro}: "
+                f"cmd_vel is not received: {expected}, we send a {sent_type[0]} as on {self.address.distro}: "
                 "set distro or stamped"
             )
         if self.commanded.blocked(now, standing=self.odometry.standing):

@@ -234,11 +234,11 @@ class Analysis:
             else sampled_loop(self.plan, self.first_links, self.shape.position)
         )
 
-    def _shapes(self, wanted: Links, there: Mask) -> list[Shape]:
+    def _shapes(self, wanted: Links, present: Mask) -> list[Shape]:
         """Shapes from the ends, the starts, the scaled distances and random places as guesses, until one is exact."""
         experiment, silent = self.plan.experiment, self.without_neighbours
         end = self.prediction.position[-1].copy()
-        rows, links = len(end), wanted.take(there)
+        rows, links = len(end), wanted.take(present)
         moves = self.placed
         aloft = np.column_stack([self.start[:, :2], self.height])
         landed = moves & (end[:, 2] < aloft[:, 2] / 2)  # robots on the floor have no place in the shape
@@ -261,8 +261,8 @@ class Analysis:
         guesses = (np.where(moves[:, None], each, end) for each in places())  # leaders are where their plans leave them
         found, solids = [], Solids.of(self.plan.kinds, links, moves)
         for each in find_shapes(links, guesses, moves, self.plan.anchors_by_row, solids=solids):
-            error = np.zeros(len(there))
-            error[there] = each.error
+            error = np.zeros(len(present))
+            error[present] = each.error
             found.append(replace(each, error=error))
         return found
 

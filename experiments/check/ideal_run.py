@@ -173,6 +173,6 @@ def approaches(prediction: Prediction, kinds: Sequence[Kind], clearance: float) 
         at = rank.argmin(axis=0)
         for k in np.flatnonzero(np.isfinite(rank.min(axis=0))):
             when = at[k]
-            there = float(far[when, k]), float(between[when, k]), float(prediction.time[when])
-            found.append(PairApproach(i, int(j[k]), float(touch[k]), *there))
+            nearest = float(far[when, k]), float(between[when, k]), float(prediction.time[when])
+            found.append(PairApproach(i, int(j[k]), float(touch[k]), *nearest))
     return found

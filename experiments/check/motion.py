@@ -279,8 +279,9 @@ def _standing_wheels(analysis: Analysis, at: int) -> Index:
     time, position = analysis.prediction.time, analysis.prediction.position
     at %= len(time)
     here, before = position[at], position[max(0, at - round(WINDOW_S * plan.experiment.rates.coordination_hz))]
-    links, there = plan.formation.at(float(time[at])), plan.formation.present(time[at : at + 1], position[at : at + 1])
-    links = links if there is None else links.take(there[0])
+    links = plan.formation.at(float(time[at]))
+    present = plan.formation.present(time[at : at + 1], position[at : at + 1])
+    links = links if present is None else links.take(present[0])
     offset = law_offsets(analysis.law, here, here[links.sender], links) + anchor_offsets(plan.anchors_by_row, here)
     length, wheels = norm(offset[:, :2]), np.array([not kind.flies for kind in plan.kinds])
     return np.flatnonzero(

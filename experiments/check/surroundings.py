@@ -194,11 +194,11 @@ def perception(analysis: Analysis) -> Iterator[Finding]:
         if sensors_of(experiment.robots[name]) or not experiment.robots[name].avoids:
             continue
         in_height = [k for k in range(len(scene.names)) if outlines.at_height(scene, k, low[row], high[row])]
-        there = [f"'{scene.names[k]}'" for k in in_height]
+        near = [f"'{scene.names[k]}'" for k in in_height]
         flies = analysis.plan.kinds[row].flies
         remedy = f'give it some: sensors = ["{"multiranger" if flies else "lds01"}"] in [robots.{name}]'
-        if there:
-            message = f"{name} has no range sensors: it cannot avoid {join_names(there)}"
+        if near:
+            message = f"{name} has no range sensors: it cannot avoid {join_names(near)}"
             yield Finding("warning", "sees-nothing", message, remedy, ("robots", name))
         elif name in isolated:
             message = f"{name} has neither neighbours nor range sensors: it avoids nothing"

@@ -262,13 +262,13 @@ def _stiffer(analysis: Analysis, missing: int) -> str:
 def presence(analysis: Analysis) -> Iterator[Finding]:
     """Check that the network stays connected along the predicted motion while links come and go."""
     plan, time = analysis.plan, analysis.prediction.time
-    there = plan.formation.present(time, analysis.prediction.position)
-    if there is None or analysis.parts > 1:
+    present = plan.formation.present(time, analysis.prediction.position)
+    if present is None or analysis.parts > 1:
         return
-    begins = np.concatenate([[0], 1 + np.flatnonzero((there[1:] != there[:-1]).any(axis=1))])
-    apart = np.array([components(plan.links.take(mask), len(plan.names)) for mask in there[begins]])
+    begins = np.concatenate([[0], 1 + np.flatnonzero((present[1:] != present[:-1]).any(axis=1))])
+    apart = np.array([components(plan.links.take(mask), len(plan.names)) for mask in present[begins]])
     if (apart == 1).all():
-        count = there.sum(axis=1)
+        count = present.sum(axis=1)
         message = f"links come and go, {count.min()} to {count.max()} at a time, and the network is always whole"
         yield Finding("note", "whole", message)
         return

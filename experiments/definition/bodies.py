@@ -74,9 +74,9 @@ def body_faults(experiment: Experiment) -> Iterator[BodyFault]:
         external, process = robot.position == "external", robot.process or name
         entry = BodyEntry(name, kind, robot.body, robot.device, external, process, hosts.get(name, ""))
         entries.setdefault(body, []).append(entry)
-    yield from shared_devices((each, body) for body, its in entries.items() for each in its)
-    for body, its in entries.items():
-        yield from body.faults(its)
+    yield from shared_devices((each, body) for body, group in entries.items() for each in group)
+    for body, group in entries.items():
+        yield from body.faults(group)
 
 
 def _fits(device: Mapping[str, Any], struct: type[msgspec.Struct] | None) -> bool:

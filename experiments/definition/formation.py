@@ -44,16 +44,16 @@ class Pattern:
     targets: tuple[tuple[Target, ...], ...]  # (E) after each change
 
     @classmethod
-    def compiled(cls, experiment: Experiment, there: Sequence[OneWay]) -> Pattern:
+    def compiled(cls, experiment: Experiment, one_way: Sequence[OneWay]) -> Pattern:
         """Pattern of these links; rows are the robots of the file."""
         row = {name: number for number, name in enumerate(experiment.robots)}
         in_order = sorted(experiment.formation.changes, key=lambda each: each.at_s)
-        after = [_targets(experiment, each, there) for each in in_order]
+        after = [_targets(experiment, each, one_way) for each in in_order]
         return cls(
-            linked([each.target for each in there], [(row[each.receiver], row[each.sender]) for each in there]),
-            tuple(there),
+            linked([each.target for each in one_way], [(row[each.receiver], row[each.sender]) for each in one_way]),
+            tuple(one_way),
             tuple(Change(each.at_s, each.over_s, each.scale, each.rotate) for each in in_order),
-            tuple(zip(*after, strict=True)) if after else ((),) * len(there),
+            tuple(zip(*after, strict=True)) if after else ((),) * len(one_way),
         )
 
     @cached_property
@@ -97,11 +97,11 @@ class Pattern:
             [(each.since, each.until, each.reach, each.release) for each in self.one_way]
         ).T
         within = (since - ROUNDING_S <= time[:, None]) & (time[:, None] < until - ROUNDING_S)
-        there, now = np.empty(apart.shape, dtype=bool), self.planned_at(0.0)
+        present, now = np.empty(apart.shape, dtype=bool), self.planned_at(0.0)
         for k, far in enumerate(apart):
             limit = np.where(now, release, reach)
-            there[k] = now = within[k] & ((limit == math.inf) | (far <= limit))
-        return there
+            present[k] = now = within[k] & ((limit == math.inf) | (far <= limit))
+        return present
 
     def exists(self, number: int, elapsed: float, apart: float, *, was: bool) -> bool:
         """Whether a link between robots `apart` [m] exists `elapsed` [s] after the start; `was`: it did before."""
@@ -220,8 +220,8 @@ def errors_over_time(law: Law, pattern: Pattern, time: Array, position: Array) -
                     every = pattern.targets_at(t)
                     targets = [every[each] for each in columns]
                 error[k, columns] = [law.error(tuple(away), link) for away, link in zip(row, targets, strict=True)]
-    there = pattern.present(time, position)
-    return error if there is None else np.where(there, error, np.nan)
+    present = pattern.present(time, position)
+    return error if present is None else np.where(present, error, np.nan)
 
 
 def compile_anchors(experiment: Experiment) -> dict[str, tuple[anchors.Anchor, ...]]:

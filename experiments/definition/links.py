@@ -86,13 +86,13 @@ def one_way_links(experiment: Experiment, law: Law) -> list[OneWay]:
             until = math.inf if given.until_s is None else given.until_s
             found.append(OneWay(receiver, sender, target, given.from_s, until, reach, release, text))
     if near is not None and near.distance is not None:
-        there = {(link.receiver, link.sender) for link in found}
+        linked = {(link.receiver, link.sender) for link in found}
         target = Link(near.distance, getattr(formation, gain_key(law, BY_DISTANCE)))
         found += [
             OneWay(a, b, target, reach=reach, release=release)
             for a in experiment.robots
             for b in experiment.robots
-            if a != b and (a, b) not in there
+            if a != b and (a, b) not in linked
         ]
     row = {name: number for number, name in enumerate(experiment.robots)}
     return sorted(found, key=lambda link: (row[link.receiver], row[link.sender]))

@@ -210,13 +210,13 @@ class Plan:
         if avoidance is None or not (avoidance.hears == "all" or centrally):
             return {}
         linked = {(link.receiver, link.sender) for link in self.one_way_links}
-        there = {(receiver, sender) for receiver, sender in linked if receiver not in centrally}
+        direct = {(receiver, sender) for receiver, sender in linked if receiver not in centrally}
         return {
             receiver: tuple(
                 sender
                 for sender in self.names
                 if sender != receiver
-                and (receiver, sender) not in there
+                and (receiver, sender) not in direct
                 and (avoidance.hears == "all" or (receiver, sender) in linked)
             )
             for receiver in self.names

@@ -155,8 +155,8 @@ def redundancy(position: Array, pairs: Index, moves: Mask | None = None) -> Redu
     everyone = np.arange(rows)
     for row in range(rows):
         others = everyone != row
-        mine = basis[(pairs == row).any(axis=1)]
-        lost = int((np.linalg.eigvalsh(mine @ mine.T) > 1.0 - CERTAIN).sum()) if len(mine) else 0
+        incident = basis[(pairs == row).any(axis=1)]
+        lost = int((np.linalg.eigvalsh(incident @ incident.T) > 1.0 - CERTAIN).sum()) if len(incident) else 0
         needed = int(free[others].sum()) - rigid_motions(position[others], free[others]) if rows > 1 else 0
         found.robots[row] = rank - lost >= needed
     return found

@@ -62,12 +62,12 @@ def _arena_beside(text: str, folder: Path) -> ArenaFile | None:
     name = arena_file.arena_file_name(tomllib.loads(text))
     if name is None:
         return None
-    wanted, there = arena_file.load(name, index.FOLDER), folder / name
+    wanted, place = arena_file.load(name, index.FOLDER), folder / name
     if isinstance(wanted, Fault):
         raise refusal(name, wanted.message, wanted.hint)
-    if there.exists() and there.read_text("utf-8") != wanted.text:
+    if place.exists() and place.read_text("utf-8") != wanted.text:
         hint = "choose another folder, or rename that file; nothing was changed"
-        raise refusal(str(there), "is another arena than that of the entry", hint)
+        raise refusal(str(place), "is another arena than that of the entry", hint)
     return wanted
 
 

@@ -243,8 +243,8 @@ class Text:
         """Raise DocumentError if there is any fault, all in the order of the file."""
         problems = dict.fromkeys(map(self.located, faults))
         if problems:
-            ours = (self.label, *(problem.file for problem in problems if not problem.line))
-            raise DocumentError(sorted(problems, key=lambda each: (each.file not in ours, each.line, each.column)))
+            files = (self.label, *(problem.file for problem in problems if not problem.line))
+            raise DocumentError(sorted(problems, key=lambda each: (each.file not in files, each.line, each.column)))
 
     def located(self, fault: Fault) -> Problem:
         stands, place = nearest(self.places, fault.path)

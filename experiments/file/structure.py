@@ -109,7 +109,7 @@ def table_faults(
         if key not in fields:
             hint = did_you_mean(key, fields)
             guessed |= {name for name in fields if hint == f"did you mean '{name}'?"}
-            found.append(_unknown(key, hint, path, plugin))
+            found.append(_unknown_key(key, hint, path, plugin))
     for name, field in fields.items():
         if name in value:
             plain = isinstance(field.default, bool | int | float | str)
@@ -139,7 +139,7 @@ def _one_table(value: Mapping[str, Any], tables: Sequence[type[msgspec.Struct]],
     return table_faults(fields, by_tag[str(tag)], path)
 
 
-def _unknown(key: str, hint: str, path: Path, plugin: tuple[str, str] | None) -> Fault:
+def _unknown_key(key: str, hint: str, path: Path, plugin: tuple[str, str] | None) -> Fault:
     """Fault of an unknown key; the hint names another table or plug-in that has it."""
     if plugin is not None:
         group, kind = plugin

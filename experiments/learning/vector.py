@@ -110,11 +110,11 @@ class Environments(gymnasium.vector.VectorEnv[Any, Any, Any]):
         self._pipes, self._processes = list[Connection](), list[Any]()
         self._own = Batch(pickled, count) if share == 1 else None
         for part in self._parts if share > 1 else ():
-            ours, theirs = context.Pipe()
-            process = context.Process(target=_serve, args=(theirs, pickled, len(part)), daemon=True)
+            parent_end, child_end = context.Pipe()
+            process = context.Process(target=_serve, args=(child_end, pickled, len(part)), daemon=True)
             process.start()
-            theirs.close()
-            self._pipes.append(ours)
+            child_end.close()
+            self._pipes.append(parent_end)
             self._processes.append(process)
 
     def reset(

@@ -63,8 +63,8 @@ def judge(cases: Sequence[CaseMetrics]) -> list[Judgement]:
     for asked in [*{msgspec.json.encode(each): each for case in cases for each in case.criteria}.values()]:
         names = [name for name in runs if asked.case in (None, name) and name != asked.relative_to]
         reference = runs.get(asked.relative_to or "", ())
-        there = {each.seed: None if each.spoiled else _value(asked, each) for each in reference}
-        found += [Judgement(asked, name, _values(asked, runs[name], there), _measures(runs[name])) for name in names]
+        by_seed = {each.seed: None if each.spoiled else _value(asked, each) for each in reference}
+        found += [Judgement(asked, name, _values(asked, runs[name], by_seed), _measures(runs[name])) for name in names]
         if not names:
             found.append(Judgement(asked, "", {}))
     return found

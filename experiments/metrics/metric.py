@@ -83,7 +83,7 @@ class Metric(msgspec.Struct, frozen=True):
         return statistics.fmean(known)
 
 
-def _ours(
+def _row(
     of: str | Callable[[Measurement], Array | Index | Sequence[Number] | float],
     label: str, meaning: str, **facts: object,
 ) -> Metric:  # fmt: skip
@@ -106,79 +106,79 @@ def _ours(
 UNSEEN: Final = {"mean": "sum", "swept": False, "shown": False}  # they do not occur in virtual time
 OF_CASE: Final = {"per": "case", "swept": False, "shown": False}
 OURS: Final[Mapping[str, Metric]] = {  # names of the fields of `RobotMetrics`, and then those of the case
-    "f_hz": _ours("rate", "f",
+    "f_hz": _row("rate", "f",
         "Transmissions over duration. Counted by running numbers, so that what a recorder lost counts too.", unit="Hz",
         relative=False, figure=True),
-    "messages": _ours(lambda m: m.transmissions[0], "Messages", "Transmissions of a robot, by their running numbers."),
-    "bytes": _ours("payload", "Payload", "Payload of the transmissions of a robot.", unit="bytes", swept=False,
+    "messages": _row(lambda m: m.transmissions[0], "Messages", "Transmissions of a robot, by their running numbers."),
+    "bytes": _row("payload", "Payload", "Payload of the transmissions of a robot.", unit="bytes", swept=False,
         shown=False),
-    "iae": _ours(lambda m: m.integrals[0], "IAE", "Integral of e(t) over the run (trapezoidal).", unit="m s", sums=True,
+    "iae": _row(lambda m: m.integrals[0], "IAE", "Integral of e(t) over the run (trapezoidal).", unit="m s", sums=True,
         figure=True),
-    "itae": _ours(lambda m: m.integrals[1], "ITAE", "Integral of t · e(t); t counts from the common start.",
+    "itae": _row(lambda m: m.integrals[1], "ITAE", "Integral of t · e(t); t counts from the common start.",
         unit="m s²", sums=True, figure=True),
-    "rmse": _ours(lambda m: m.integrals[2], "RMSE", "Root of the mean of e(t)².", unit="m", shown=False, figure=True),
-    "acquired_s": _ours("acquired", "Acquired",
+    "rmse": _row(lambda m: m.integrals[2], "RMSE", "Root of the mean of e(t)².", unit="m", shown=False, figure=True),
+    "acquired_s": _row("acquired", "Acquired",
         "From when on the moving mean over one second of the error of each link stays within the tolerance, until the"
         " next phase or the end; 0 if it never left. \"By all\" is when the last follower was there; the mean over"
         " followers is of their own times, and is given only if every follower acquired.", unit="s", mean="all",
         relative=False),
-    "updates": _ours("trace.decisions", "Updates", "Goals that a robot recomputed.", relative=False, shown=False),
-    "lost": _ours("trace.lost", "Lost samples", "Poses that by their numbers were sent and never reached a receiver.",
+    "updates": _row("trace.decisions", "Updates", "Goals that a robot recomputed.", relative=False, shown=False),
+    "lost": _row("trace.lost", "Lost samples", "Poses that by their numbers were sent and never reached a receiver.",
         **UNSEEN),
-    "dropped": _ours("dropped", "Dropped", "Poses that the modelled network dropped, over all receivers.", mean="sum",
+    "dropped": _row("dropped", "Dropped", "Poses that the modelled network dropped, over all receivers.", mean="sum",
         relative=False),
-    "missed_deadlines": _ours("trace.missed_deadlines", "Missed deadlines",
+    "missed_deadlines": _row("trace.missed_deadlines", "Missed deadlines",
         "Ticks that were skipped because their time had passed; shares are of the ticks that were due.", **UNSEEN),
-    "j2": _ours("cost", "J2",
+    "j2": _row("cost", "J2",
         "Cost of the authors' benchmark: 0.02 · transmissions + 0.1 · decisions + 0.3 · settling time + 0.1 · IAE +"
         " 0.01 · ITAE, summed over the robots that receive poses, all until the settling time: the last time at which"
         " Σ(r² − d²) is farther from its end than 2 % of its way. IAE and ITAE are halved: a link has two ends.",
         **OF_CASE),
-    "belief_rms": _ours(lambda m: np.sqrt(mean_known(m.belief.reshape(-1) ** 2)), "Belief error, RMS",
+    "belief_rms": _row(lambda m: np.sqrt(mean_known(m.belief.reshape(-1) ** 2)), "Belief error, RMS",
         "Error of a receiver's estimate of a neighbour, over all links: the newest pose received, carried on by the"
         " prediction until the next.", unit="m", **OF_CASE),
-    "belief_max": _ours(lambda m: m.belief.max(initial=-np.inf, where=np.isfinite(m.belief)), "Belief error, largest",
+    "belief_max": _row(lambda m: m.belief.max(initial=-np.inf, where=np.isfinite(m.belief)), "Belief error, largest",
         "The largest of these errors.", unit="m", **OF_CASE),
-    "closest": _ours(lambda m: closest_distance(m.trace.true_position), "Closest robots",
+    "closest": _row(lambda m: closest_distance(m.trace.true_position), "Closest robots",
         "Smallest distance between two centres.", unit="m", better="more", **OF_CASE),
 }  # fmt: skip
 DETAILS: Final[dict[str, Metric]] = {  # fields of `RobotMetrics` without a mean
-    "residual": _ours(lambda m: [each.residual for each in m.phases[0]], "Worst link",
+    "residual": _row(lambda m: [each.residual for each in m.phases[0]], "Worst link",
         "|error| of the worst link, averaged over the last second of the first phase.", unit="m"),
-    "settle_s": _ours("settled", "Settled",
+    "settle_s": _row("settled", "Settled",
         "When e(t) enters the 2 % band of its largest value for good; the duration of the run if never.", unit="s"),
-    "missed_share": _ours(lambda m: m.trace.missed_deadlines / (m.trace.ticks + m.trace.missed_deadlines), "Missed",
+    "missed_share": _row(lambda m: m.trace.missed_deadlines / (m.trace.ticks + m.trace.missed_deadlines), "Missed",
         "Missed deadlines over the ticks that were due, made or missed."),
-    "gap_min_s": _ours(lambda m: m.gap(np.min), "Shortest gap", "Shortest time between transmissions.", unit="s"),
-    "gap_median_s": _ours(lambda m: m.gap(np.median), "Median gap", "Median time between transmissions.", unit="s"),
-    "gap_max_s": _ours(lambda m: m.gap(np.max), "Longest gap", "Longest time between transmissions.", unit="s"),
-    "recorded": _ours(lambda m: m.transmissions[1], "Recorded", "Poses in the recording."),
-    "receivers": _ours("architecture.receivers", "Receivers", "Receivers, the central controller too."),
-    "received": _ours("architecture.received", "Received", "Poses received, by all receivers together."),
-    "coverage": _ours(lambda m: m.errors.coverage() if m.has_errors else [None] * len(m.trace.robots), "Known errors",
+    "gap_min_s": _row(lambda m: m.gap(np.min), "Shortest gap", "Shortest time between transmissions.", unit="s"),
+    "gap_median_s": _row(lambda m: m.gap(np.median), "Median gap", "Median time between transmissions.", unit="s"),
+    "gap_max_s": _row(lambda m: m.gap(np.max), "Longest gap", "Longest time between transmissions.", unit="s"),
+    "recorded": _row(lambda m: m.transmissions[1], "Recorded", "Poses in the recording."),
+    "receivers": _row("architecture.receivers", "Receivers", "Receivers, the central controller too."),
+    "received": _row("architecture.received", "Received", "Poses received, by all receivers together."),
+    "coverage": _row(lambda m: m.errors.coverage() if m.has_errors else [None] * len(m.trace.robots), "Known errors",
         "Known share of a robot's link errors."),
-    "known": _ours("known", "Known", "Share of the run in which the robot's own position is known."),
-    "collisions": _ours(lambda m: list(map(len, m.contacts)), "Collisions", "Contacts with robots, obstacles, walls."),
-    "impulse": _ours(
+    "known": _row("known", "Known", "Share of the run in which the robot's own position is known."),
+    "collisions": _row(lambda m: list(map(len, m.contacts)), "Collisions", "Contacts with robots, obstacles, walls."),
+    "impulse": _row(
         lambda m: [max((c.impulse for c in own if c.impulse is not None), default=None) for own in m.contacts],
         "Impulse", "Impulse of the hardest contact.", unit="N s"),
-    "overlap": _ours(lambda m: [max((c.overlap for c in own), default=None) for own in m.contacts], "Overlap",
+    "overlap": _row(lambda m: [max((c.overlap for c in own), default=None) for own in m.contacts], "Overlap",
         "Depth of the deepest contact.", unit="m"),
-    "short": _ours("short", "Short", "Distance from the end of the robot's plan.", unit="m"),
-    "interventions": _ours("trace.interventions", "Interventions", "Ticks on which safety changed the decision."),
-    "intervened_share": _ours(lambda m: m.trace.interventions / m.trace.ticks, "Changed by safety",
+    "short": _row("short", "Short", "Distance from the end of the robot's plan.", unit="m"),
+    "interventions": _row("trace.interventions", "Interventions", "Ticks on which safety changed the decision."),
+    "intervened_share": _row(lambda m: m.trace.interventions / m.trace.ticks, "Changed by safety",
         "Share of the ticks on which safety changed the decision."),
-    "avoided": _ours("trace.avoided", "Avoided", "Ticks on which avoidance changed the decision."),
-    "avoided_share": _ours(lambda m: m.trace.avoided / m.trace.ticks, "By avoidance",
+    "avoided": _row("trace.avoided", "Avoided", "Ticks on which avoidance changed the decision."),
+    "avoided_share": _row(lambda m: m.trace.avoided / m.trace.ticks, "By avoidance",
         "Share of the ticks on which avoidance changed the decision."),
-    "goals": _ours("architecture.goals", "Goals", "Goals that the central controller sent."),
-    "goal_bytes": _ours("architecture.goal_bytes", "Payload of goals", "Payload of the goals of a robot.",
+    "goals": _row("architecture.goals", "Goals", "Goals that the central controller sent."),
+    "goal_bytes": _row("architecture.goal_bytes", "Payload of goals", "Payload of the goals of a robot.",
         unit="bytes"),
-    "delay_mean_s": _ours("architecture.delay_mean_s", "Delay, mean",
+    "delay_mean_s": _row("architecture.delay_mean_s", "Delay, mean",
         "From the measurement of a pose until the robot acts on the first goal that rests on it.", unit="s"),
-    "delay_p95_s": _ours("architecture.delay_p95_s", "Delay, 95 %", "95 % of the same delays are shorter.", unit="s"),
-    "delay_max_s": _ours("architecture.delay_max_s", "Delay, longest", "The longest of the same delays.", unit="s"),
-    "foreign": _ours(lambda m: [0] * len(m.trace.robots) if m.trace.foreign is None else m.trace.foreign,
+    "delay_p95_s": _row("architecture.delay_p95_s", "Delay, 95 %", "95 % of the same delays are shorter.", unit="s"),
+    "delay_max_s": _row("architecture.delay_max_s", "Delay, longest", "The longest of the same delays.", unit="s"),
+    "foreign": _row(lambda m: [0] * len(m.trace.robots) if m.trace.foreign is None else m.trace.foreign,
         "Foreign poses", "Poses in the robot's name that did not come from its process, and were refused."),
 }  # fmt: skip
 FIGURES: Final = {**OURS, **DETAILS}  # figures of ours: those of robots are the fields of `RobotMetrics`
@@ -227,11 +227,11 @@ def _of_measure(name: str, measure: Measure) -> tuple[Metric, Metric]:
     facts |= {"applies": lambda _metric, trace: name in trace.measures}
     judged = bool(measure.better)
     return (
-        _ours(
+        _row(
             lambda m: mean_known(m.trace.measures[name]), f"{name} (mean)",
             f"Measure {name} of the law, mean over the run.", relative=judged, figure=judged, **facts,
         ),
-        _ours(
+        _row(
             lambda m: mean_known(m.trace.measures[name][-m.window :]), f"{name} (end)",
             f"Measure {name} of the law, mean over the last second.", relative=False, **facts,
         ),
@@ -263,7 +263,7 @@ def from_facts(facts: Mapping[str, Mapping[str, Any]]) -> dict[str, Metric]:
     """Metrics as `facts_of` describes them, without a way to measure them; raises ValueError for other facts."""
     if any({*_FACTS, "meaning"} != {*each} for each in facts.values()):
         raise ValueError("metrics of another version")
-    return {name: _ours(_elsewhere, **each) for name, each in facts.items()}
+    return {name: _row(_elsewhere, **each) for name, each in facts.items()}
 
 
 def _elsewhere(_shared: Measurement) -> float:

@@ -73,7 +73,7 @@ class LinkErrors:
     alive: Mask  # (T, N) whether the robot's own position is known
     # (T, N) whether a robot was to be there: not before it joined, nor while the network was away (see `network_away`),
     # when an unknown position tells nothing of it
-    there: Mask
+    present: Mask
     gone: Mask  # (T, N) from then on neither a robot's position nor an error of its links is known any more
     away_s: float  # [s] time without any known position in the whole trace, see `network_away`
 
@@ -82,13 +82,13 @@ class LinkErrors:
         pattern, rows = trace.plan.formation, len(trace.robots)
         alive = np.asarray(np.isfinite(trace.true_position).all(axis=2))
         away_s, away = network_away(alive, trace.time)
-        there = np.repeat(~away[:, None], rows, axis=1)
+        present = np.repeat(~away[:, None], rows, axis=1)
         if trace.joined is not None:
-            there &= trace.time[:, None] >= trace.joined
+            present &= trace.time[:, None] >= trace.joined
         alive &= ~trace.blind
         own, error = counted_links(trace.plan.law, pattern, rows), trace.link_errors
         gone = ~np.maximum.accumulate((alive & (np.isfinite(error) @ own > 0.0))[::-1])[::-1]
-        return cls(trace.time, pattern.links, own, error, alive, there, np.asarray(gone), away_s)
+        return cls(trace.time, pattern.links, own, error, alive, present, np.asarray(gone), away_s)
 
     def part(self, begin: int, end: int) -> LinkErrors:
         """The same from one row in time to another."""
@@ -106,15 +106,15 @@ class LinkErrors:
         outside = (total > tolerance * count + 1e-12).astype(float) @ self.own > 0.0
         known = (np.isfinite(self.error) @ self.own > 0.0) & self.alive
         last = np.maximum.accumulate(np.where(known, np.arange(len(known))[:, None], -1), axis=0)
-        before = np.take_along_axis(outside, np.maximum(last, 0), axis=0) | ((last < 0) & self.there)
+        before = np.take_along_axis(outside, np.maximum(last, 0), axis=0) | ((last < 0) & self.present)
         return after_last(before | self.gone, self.time)
 
     def gaps(self) -> list[tuple[int, float, float]]:
         """Times [s, s] without the position of a robot, by its row, until it is known again; no absence of all."""
-        unknown = ~self.alive & self.there & np.maximum.accumulate(self.alive, axis=0)
+        absent = ~self.alive & self.present & np.maximum.accumulate(self.alive, axis=0)
         found = []
         for row in range(self.alive.shape[1]):
-            edges = np.flatnonzero(np.diff(unknown[:, row], prepend=False, append=False))
+            edges = np.flatnonzero(np.diff(absent[:, row], prepend=False, append=False))
             for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
                 if end < len(self.time):
                     found.append((row, float(self.time[begin]), float(self.time[end])))
@@ -122,8 +122,8 @@ class LinkErrors:
 
     def coverage(self) -> Array:
         """(N,) known share of the errors of each robot's links while both ends were to be there; 0 without links."""
-        there = self.there[:, self.net.receiver] & self.there[:, self.net.sender]
-        covered = (np.isfinite(self.error) & there).sum(axis=0) / np.maximum(there.sum(axis=0), 1)
+        present = self.present[:, self.net.receiver] & self.present[:, self.net.sender]
+        covered = (np.isfinite(self.error) & present).sum(axis=0) / np.maximum(present.sum(axis=0), 1)
         return np.asarray((covered @ self.own) / np.maximum(self.own.sum(axis=0), 1.0))
 
     def worst(self, names: Sequence[str]) -> list[tuple[float | None, str]]:
@@ -449,8 +449,8 @@ class Measurement:
     @_kept
     def known(self) -> Array:
         """Share of the time at which each robot was to be there, at which its position is known (N,); 0 without any."""
-        there = self.errors.there
-        return np.asarray((self.errors.alive & there).sum(axis=0) / np.maximum(there.sum(axis=0), 1))
+        present = self.errors.present
+        return np.asarray((self.errors.alive & present).sum(axis=0) / np.maximum(present.sum(axis=0), 1))
 
     @_kept
     def died(self) -> tuple[str, ...]:
@@ -504,7 +504,7 @@ class Measurement:
         if not self.has_errors:
             return np.full(total.shape[1], np.nan)
         unsettled = ~(total <= BAND * np.where(np.isfinite(total), total, 0.0).max(axis=0))
-        found = after_last(unsettled & (self.errors.there | np.isfinite(total)), time)
+        found = after_last(unsettled & (self.errors.present | np.isfinite(total)), time)
         return np.array([time[-1] - time[0] if when is None else when for when in found])
 
     @_kept
@@ -550,13 +550,13 @@ class Measurement:
         return np.asarray((sent - early) / present)
 
     @_kept
-    def waits(self) -> list[Array]:
+    def gaps_between(self) -> list[Array]:
         """Times between the transmissions of each robot [s]."""
         return [np.diff(np.sort(self.trace.sent_by(i).stamp)) for i in range(len(self.trace.robots))]
 
     def gap(self, statistic: Callable[[Array], Any]) -> list[float | None]:
         """A statistic of these times of each robot [s]; None for fewer than two transmissions."""
-        return [float(statistic(each)) if len(each) else None for each in self.waits]
+        return [float(statistic(each)) if len(each) else None for each in self.gaps_between]
 
     @_kept
     def payload(self) -> Index:

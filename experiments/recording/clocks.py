@@ -23,14 +23,14 @@ class ClockSample:
     """Question to a host, and the answer."""
 
     left: float  # [s] our clock, when the question left
-    there: float  # [s] the host's clock
+    host: float  # [s] the host's clock
     back: float  # [s] our clock, when the answer came back
 
 
 def host_offset(samples: Sequence[ClockSample]) -> tuple[float, float]:
     """The host's clock less ours [s], and how far off that can be [s], by the sample of the shortest round trip."""
     best = min(samples, key=lambda sample: sample.back - sample.left)
-    return best.there - (best.left + best.back) / 2, (best.back - best.left) / 2
+    return best.host - (best.left + best.back) / 2, (best.back - best.left) / 2
 
 
 @dataclass(frozen=True)

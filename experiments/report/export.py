@@ -89,8 +89,8 @@ def write_csv(traces: Mapping[str, Trace], file: Path) -> None:
         table = csv.writer(stream)
         table.writerow(["case", "time", "robot", *COLUMNS, *of_law])
         for case, trace in traces.items():
-            unknown = np.full(trace.yaw.shape, np.nan)
-            values = np.stack([columns[case].get(name, unknown) for name in (*COLUMNS, *of_law)], axis=2)
+            blank = np.full(trace.yaw.shape, np.nan)
+            values = np.stack([columns[case].get(name, blank) for name in (*COLUMNS, *of_law)], axis=2)
             cells = values.astype(object)
             cells[~np.isfinite(values)] = None
             for t, rows in zip(trace.time.tolist(), cells.tolist(), strict=True):

@@ -391,13 +391,13 @@ def intervals(traces: Sequence[Trace], width: float = style.WIDTH) -> Figure:
     for k, trace in enumerate(traces):
         colour = style.CASES[k % len(style.CASES)]
         shared = Measurement.of(trace)
-        named = zip(shared.waits, trace.robots, strict=True)
-        waits = [wait for wait, name in named if name not in shared.leaders and len(wait)]
-        for wait in waits if len(waits) > 1 else []:
+        named = zip(shared.gaps_between, trace.robots, strict=True)
+        gaps = [wait for wait, name in named if name not in shared.leaders and len(wait)]
+        for wait in gaps if len(gaps) > 1 else []:
             axes.plot(*_steps(wait), color=colour, linewidth=0.5, alpha=0.45, drawstyle="steps-post")
-        if waits:
+        if gaps:
             line: style.Line = {"color": colour, "linewidth": 1.5, "linestyle": ("-", "--", "-.", ":")[k % 4]}
-            axes.plot(*_steps(np.concatenate(waits)), drawstyle="steps-post", **line)
+            axes.plot(*_steps(np.concatenate(gaps)), drawstyle="steps-post", **line)
             handles.setdefault(style.plain(trace.case), Line2D([], [], **line))
     axes.set_xscale("log")
     axes.xaxis.set_major_formatter(style.in_full())
@@ -449,9 +449,9 @@ def _points(axes: Axes, x: NDArray[np.floating], found: Sequence[Spread], *, k: 
             axes.annotate("0", (at, 0.02), fontsize=6, color=colour, **edge)
 
 
-def _steps(waits: Array) -> tuple[Array, Array]:
-    """The empirical distribution, style.thinned to what a column can show."""
-    x = np.sort(np.maximum(waits, 1e-4))
+def _steps(gaps: Array) -> tuple[Array, Array]:
+    """The empirical distribution, thinned to what a column can show."""
+    x = np.sort(np.maximum(gaps, 1e-4))
     share = np.arange(1, len(x) + 1) / len(x)
     few = np.unique(np.linspace(0, len(x) - 1, 300).round().astype(int))
     return np.concatenate([x[:1], x[few]]), np.concatenate([[0.0], share[few]])

@@ -67,17 +67,17 @@ def criteria_met(cases: Sequence[CaseMetrics]) -> list[VerdictLine]:
     found = criteria.judge(cases)
     if not found:
         return []
-    bad, unknown = ([each for each in found if each.passed is what] for what in (False, None))
-    count = f"{len(found) - len(bad) - len(unknown)} of {len(found)} criteria are met"
+    bad, unjudged = ([each for each in found if each.passed is what] for what in (False, None))
+    count = f"{len(found) - len(bad) - len(unjudged)} of {len(found)} criteria are met"
     seeds = max(len(each.values) for each in found)
     count += f" by all {seeds} seeds" * (seeds > 1)
-    words = "Not passed" if bad else "Not judged as a whole" if unknown else "Passed"
-    mark: Mark = "bad" if bad else "fair" if unknown else "good"
+    words = "Not passed" if bad else "Not judged as a whole" if unjudged else "Passed"
+    mark: Mark = "bad" if bad else "fair" if unjudged else "good"
     return [
         VerdictLine(mark, f"{words}: {count}."),
         *(VerdictLine("bad", _missed(each)) for each in bad),
         *(VerdictLine("plain", _met(each)) for each in found if each.passed),
-        *(VerdictLine("fair", f"Not judged: {each.what} ({each.limit}), since that was not run.") for each in unknown),
+        *(VerdictLine("fair", f"Not judged: {each.what} ({each.limit}), since that was not run.") for each in unjudged),
     ]
 
 
@@ -138,8 +138,8 @@ def interruptions(cases: Sequence[CaseMetrics]) -> Lines:
     for run in cases:
         if run.interrupted:
             where = f"{run.case} was interrupted" if several else "Interrupted"
-            when, its = f"{run.duration_s:.1f} s of {run.planned_s:g} s", "its " if several else ""
-            yield VerdictLine("fair", f"{where} after {when}: all {its}figures are up to there.")
+            when, possessive = f"{run.duration_s:.1f} s of {run.planned_s:g} s", "its " if several else ""
+            yield VerdictLine("fair", f"{where} after {when}: all {possessive}figures are up to there.")
         if run.away_s:
             where = f"In {run.case} the" if several else "The"
             text = f"{where} network was away for {run.away_s:.1f} s: errors are over the rest of the time."

@@ -254,8 +254,8 @@ class SceneDrawing:
         ends = appearance.segments(self.stage, moment.position)
         colours = appearance.link_colours(moment.error)
         both = np.repeat(colours[:, None], 2, axis=1)
-        there = ~np.isnan(moment.error) & self.shown.links
-        whole = there & ~moment.broken
+        drawn = ~np.isnan(moment.error) & self.shown.links
+        whole = drawn & ~moment.broken
         _update(self._links, "points", appearance.visible(ends, whole))
         _update(self._links, "colors", both)
         _update(self._lit, "points", appearance.visible(ends, whole & appearance.lit(self.stage, moment)))

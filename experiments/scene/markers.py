@@ -81,7 +81,7 @@ def _links(stage: SceneModel, tracker: LinkTracker, since: float, position: np.n
         return []
     error = tracker.errors(since, position)
     ends = segments(stage, position)
-    there = np.isfinite(ends).all(axis=(1, 2)) & (~np.isnan(error) | (stage.plan is None))
-    points = [tuple(point) for pair in ends[there].tolist() for point in pair] or [NOWHERE, NOWHERE]
-    colours = [tuple(c) for c in link_colours(error[there]).tolist() for _ in range(2)] or [UNKNOWN, UNKNOWN]
+    drawn = np.isfinite(ends).all(axis=(1, 2)) & (~np.isnan(error) | (stage.plan is None))
+    points = [tuple(point) for pair in ends[drawn].tolist() for point in pair] or [NOWHERE, NOWHERE]
+    colours = [tuple(c) for c in link_colours(error[drawn]).tolist() for _ in range(2)] or [UNKNOWN, UNKNOWN]
     return [Marker("links", LINE_LIST, (LINE_M, 0.0, 0.0), UNKNOWN, points=points, colours=colours)]

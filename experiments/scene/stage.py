@@ -222,9 +222,9 @@ class SceneModel:
             place[row, :2] = begin + step * (np.array(goal) - begin)
             touching = (each for each in self.overlaps(place, moment.obstacles, None) if name in each[:2])
             found.append([each.second if each.first == name else each.first for each in touching])
-        there = found[0]
-        between = dict.fromkeys(other for others in found[1:] for other in others if other not in there)
-        return there, list(between)
+        blocking = found[0]
+        between = dict.fromkeys(other for others in found[1:] for other in others if other not in blocking)
+        return blocking, list(between)
 
     @cached_property
     def flies(self) -> Mask:
@@ -315,8 +315,8 @@ class LinkTracker:
         NaN where none is known, as of a leader, which receives on none.
         """
         known = np.isfinite(error)
-        there = np.bincount(self._stage.links.receiver[known], minlength=len(self._stage.names)) > 0
-        return np.where(there, sums_of_errors(self._stage, error), np.nan)
+        receives = np.bincount(self._stage.links.receiver[known], minlength=len(self._stage.names)) > 0
+        return np.where(receives, sums_of_errors(self._stage, error), np.nan)
 
 
 def drawn_errors(plan: Plan, time: Array, position: Array, error: Array | None = None) -> Array:
@@ -327,8 +327,8 @@ def drawn_errors(plan: Plan, time: Array, position: Array, error: Array | None =
     """
     pattern = plan.formation
     error = errors_over_time(plan.law, pattern, time, position) if error is None else error
-    there = pattern.present(time, position)
-    bare = ~targeted(plan.law, pattern) if there is None else there & ~targeted(plan.law, pattern)
+    present = pattern.present(time, position)
+    bare = ~targeted(plan.law, pattern) if present is None else present & ~targeted(plan.law, pattern)
     return np.where(bare, BARE, error)
 
 
@@ -397,8 +397,8 @@ def segments(stage: SceneModel, position: Array) -> Array:
 
 def visible(ends: Array, which: Mask) -> Array:
     """Segments (E, 2, 3) with those hidden that are not chosen, or not known."""
-    there = which & np.isfinite(ends).all(axis=(1, 2))
-    return np.where(there[:, None, None], ends, NOWHERE)
+    drawn = which & np.isfinite(ends).all(axis=(1, 2))
+    return np.where(drawn[:, None, None], ends, NOWHERE)
 
 
 def dashes(ends: Array) -> Array:

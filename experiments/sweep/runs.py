@@ -175,7 +175,7 @@ def run_metrics(trace: Trace) -> RunMetrics:
     return RunMetrics(
         seed=trace.seed,
         values=case_values(metrics, values, shared.kept, sums=True),
-        gap_min_s=min((float(wait.min()) for wait in shared.waits if len(wait)), default=None),
+        gap_min_s=min((float(wait.min()) for wait in shared.gaps_between if len(wait)), default=None),
         duration_s=float(trace.time[-1] - trace.time[0]),
         failure="; ".join(failures(trace, shared.known.tolist())) or _early_end(trace),
         metric_faults=faults,

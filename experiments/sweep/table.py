@@ -189,9 +189,9 @@ def known_numbers(
     rows: Sequence[CellRow], metrics: Mapping[str, Metric]
 ) -> dict[str, tuple[str, Callable[[CellRow], str]]]:
     """Columns of `numbers` without those of errors where no link has any."""
-    unknown = {short_name(name) for name in ("iae", "itae", "acquired_s")}
+    errors = {short_name(name) for name in ("iae", "itae", "acquired_s")}
     bare = all(row.mean.get("iae", UNKNOWN).mean is None for row in rows)
-    return {name: column for name, column in numbers(metrics).items() if not bare or name not in unknown}
+    return {name: column for name, column in numbers(metrics).items() if not bare or name not in errors}
 
 
 def text(rows: Sequence[CellRow], metrics: Mapping[str, Metric]) -> list[str]:

@@ -208,9 +208,9 @@ class Acting:
         what = f"{name} to x = {x:.2f} m, y = {y:.2f} m"
         if not (isfinite(x) and isfinite(y)) or self._refuse(event.client_id, what):
             return
-        there, between = self._stage.in_the_way(self._moment, name, (x, y))
-        if there:
-            self._note(what, f"not ordered: it would touch {', '.join(there)} there.", bad=True)
+        blocking, between = self._stage.in_the_way(self._moment, name, (x, y))
+        if blocking:
+            self._note(what, f"not ordered: it would touch {', '.join(blocking)} there.", bad=True)
             return
         order, warning = messages.Order("go", goal=(x, y)), ""
         if between and self._stage.margin <= 0.0:

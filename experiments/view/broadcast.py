@@ -73,7 +73,7 @@ class Broadcast:
         self._declared += watches
 
         def refuse_strangers(own: Sequence[str] = ()) -> None:
-            found = {token for watch in watches for token, there in watch.changes() if there}
+            found = {token for watch in watches for token, stands in watch.changes() if stands}
             if strangers := {token for token in found if token not in own and Keys.life_of(token) != zid}:
                 raise ExplainedError(_occupied(keys, strangers))
 

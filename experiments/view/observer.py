@@ -83,17 +83,17 @@ class Observer:
         """Takes in what has arrived; returns whether another case has begun, with another stage."""
         now = time.monotonic()
         changed = self._read_experiment()
-        for name, there in self._feed.alive():
+        for name, stands in self._feed.alive():
             report = self._report(name)
-            report.alive = there
-            report.known |= there
-        for _, there in self._conductor.changes():
-            self.conducted = there
+            report.alive = stands
+            report.known |= stands
+        for _, stands in self._conductor.changes():
+            self.conducted = stands
         for status in self._feed.statuses.read():
             self._receive_status(status, now)
         self._read_states(now)
         for sample in received(self._poses.handler):
-            sender = self._keys.whose(str(sample.key_expr))
+            sender = self._keys.robot_of(str(sample.key_expr))
             if sender is not None:
                 report = self._report(sender)
                 report.sent_at, report.sent = now, report.sent + 1

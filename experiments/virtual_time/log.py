@@ -277,8 +277,8 @@ class RunRecorder:
             sent = np.bincount(log.sent.link[log.sent.stamp <= end + until], minlength=len(log.names))
             received = np.bincount(receiver[log.received.arrival <= end + until], minlength=len(log.names))
             for row, name in enumerate(log.names):
-                mine = self._links.receiver == row
-                each = zip(self._links.sender[mine].tolist(), self._log.lost[mine].tolist(), strict=True)
+                incoming = self._links.receiver == row
+                each = zip(self._links.sender[incoming].tolist(), self._log.lost[incoming].tolist(), strict=True)
                 yield messages.Status(
                     robot=name,
                     stamp=EPOCH + end,
@@ -286,7 +286,7 @@ class RunRecorder:
                     reason=ends.get(row, FINISHED),
                     sent=int(sent[row]),
                     received=int(received[row]),
-                    lost={log.names[s]: 0 for s in self._links.sender[mine].tolist()},
+                    lost={log.names[s]: 0 for s in self._links.sender[incoming].tolist()},
                     dropped={log.names[s]: n for s, n in each if n},
                     ticks=log.ticks,
                     decisions=int(log.updates[row]),

@@ -24,8 +24,8 @@ from experiments.arrays import PoseTable
 from experiments.definition.link_conditions import FROM_CENTRE, TO_CENTRE, conditions_of
 from experiments.definition.plan import Plan
 from experiments.recording.trace import EPOCH
-from experiments.virtual_time.company import SENT, Ledger, Member, Way
 from experiments.virtual_time.steps import words_of
+from experiments.virtual_time.tick import SENT, Ledger, LinkQueue, Member
 from twins.arrays import Array, Index
 
 
@@ -222,7 +222,7 @@ class VirtualNetwork:
 
     # ------------------------------------------------------------------ compiled stretches
 
-    def board(self, ways: Sequence[Way]) -> list[tuple[int, float, Sample]]:
+    def board(self, ways: Sequence[LinkQueue]) -> list[tuple[int, float, Sample]]:
         """Hand all samples that are under way to the `ways` of their links; returns them."""
         under_way = self._channel.due(inf)
         for way in ways:
@@ -238,7 +238,7 @@ class VirtualNetwork:
             self._channel.put(link, arrival, sample)
 
     def leave(
-        self, ways: Sequence[Way], members: Sequence[Member], ledger: Ledger, before: Sequence[Arrived], t: float
+        self, ways: Sequence[LinkQueue], members: Sequence[Member], ledger: Ledger, before: Sequence[Arrived], t: float
     ) -> None:
         """Take over what members sent until `t` [s], by their ledger, and what was received of it and of `before`."""
         for member in members:
@@ -261,7 +261,7 @@ class VirtualNetwork:
         if not self._lean:
             self._receive_all(ways, sent, before, t)
 
-    def _receive_all(self, ways: Sequence[Way], sent: Array, before: Sequence[Arrived], t: float) -> None:
+    def _receive_all(self, ways: Sequence[LinkQueue], sent: Array, before: Sequence[Arrived], t: float) -> None:
         """Note what was received until `t` [s] of what was `sent` (K, 10), and of what was under way `before`."""
         first = np.array([_row(sample) for _, _, sample in before]).reshape(-1, SENT)
         links = [np.array([link for link, _, _ in before], dtype=float)]

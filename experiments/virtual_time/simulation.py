@@ -24,11 +24,11 @@ from agents.safety.hazards import HazardChange
 from experiments.arrays import PoseTable
 from experiments.definition.bodies import body_request, shadow_periods, shared_world
 from experiments.definition.plan import Plan
-from experiments.virtual_time.company import AT_END, AT_HAZARDS, LEAN, PLACES, WIDTH, Ledger
 from experiments.virtual_time.conductor import PATIENCE_S, Stuck, VirtualConductor
 from experiments.virtual_time.network import CentreLog, VirtualNetwork
 from experiments.virtual_time.steps import Steps
 from experiments.virtual_time.stretch import Stretches, TornError, stretches_of
+from experiments.virtual_time.tick import AT_END, AT_HAZARDS, LEAN, PLACES, WIDTH, Ledger
 from twins.arrays import Array, Index
 from twins.body import TwinBody
 from twins.engines.engine import Engine, Touch
@@ -298,7 +298,7 @@ class VirtualRun:
         for row, robot in enumerate(robots):
             if not robot.is_steady(t):
                 robot.live(t)
-            if robot.question(t) and row not in network.retired:
+            if robot.transmission_due(t) and row not in network.retired:
                 network.transmit(row, robot, t, robot.now.state.yaw, start)
                 sent = True
         if sent and network.instant:

@@ -15,8 +15,8 @@ import numpy as np
 from agents.decision.goals import GoalComputer
 from agents.decision.stepping import Words
 from agents.plugins.law import is_known
-from experiments.virtual_time.company import Ledger, Member, Stage
 from experiments.virtual_time.records import MEASURES, Image
+from experiments.virtual_time.tick import Ledger, Member, Stage
 from twins.arrays import Array
 from twins.body import TwinBody
 from twins.engines.engine import Touch
@@ -113,9 +113,9 @@ class Steps:
         measured = table[:, :, ledger.memory].astype(np.intp)
         measures, memory = dict[str, Array](), dict[str, Array]()
         for k, name in enumerate(self.measures):
-            there = (measured >> k & 1).astype(bool)
-            if there.any():
-                measures[name] = np.where(there, table[:, :, ledger.memory + 1 + k], np.nan)
+            arrived = (measured >> k & 1).astype(bool)
+            if arrived.any():
+                measures[name] = np.where(arrived, table[:, :, ledger.memory + 1 + k], np.nan)
         for row, law in self._laws if ledger.memory else ():
             begin = 0
             for name, values in sorted(law.memory.items()):

@@ -17,11 +17,11 @@ from agents.decision.lifecycle import READY
 from agents.plugins.planners import NO_TARGET, Itinerary
 from agents.robot import Robot
 from experiments.definition.plan import Plan
-from experiments.virtual_time import company, machine
-from experiments.virtual_time.company import AT_END, Crew, Ledger, Member, Planned, Way
+from experiments.virtual_time import machine, tick
 from experiments.virtual_time.network import VirtualNetwork
 from experiments.virtual_time.records import Image, Layouts, RecordLayout
 from experiments.virtual_time.steps import Steps
+from experiments.virtual_time.tick import AT_END, Crew, Ledger, LinkQueue, Member, PlannedTargets
 from experiments.virtual_time.translator.kinds import BOOLEAN, DOUBLE, WHOLE, OutsideError
 from experiments.virtual_time.translator.translation import Program
 from twins.body import TwinBody
@@ -171,14 +171,14 @@ class Stretches:
             Member(row, robot, twin, sum(says.values()))
             for row, (robot, twin) in enumerate(zip(flight.robots, twins, strict=True))
         ]
-        self._steps, self._ways = Steps(self._members, flight.twin, flight.touches), list[Way]()
+        self._steps, self._ways = Steps(self._members, flight.twin, flight.touches), list[LinkQueue]()
         for (robot, k), channel in zip(network.receivers, network.channels, strict=True):
             sender = robot.neighbours.all[k]
             late = min(LATE * channel.jitter, LATEST_S)
-            way = Way(sender, channel, ROOM + round((channel.delay + late) * rates.pose_hz), sum(says.values()))
+            way = LinkQueue(sender, channel, ROOM + round((channel.delay + late) * rates.pose_hz), sum(says.values()))
             self._members[sender.sender].ways.append(way)
             self._ways.append(way)
-        self._plans: dict[int, Planned] = {}
+        self._plans: dict[int, PlannedTargets] = {}
         self.flown, self.refusal = 0, ""
         self._prepared: Prepared | None = None
         self._paused_until, self._pause = 0, PAUSE
@@ -308,7 +308,7 @@ class Stretches:
             for number in range(first, first + (end - k) // every + 2):
                 t = (k + number * every - robot.tick) * flight.dt
                 targets.append(itinerary.target(t - begin, place, np.nan) if robot.begun else NO_TARGET)
-            planned = self._plans.setdefault(row, Planned(hz))
+            planned = self._plans.setdefault(row, PlannedTargets(hz))
             planned.first, planned.targets = first, targets
             robot.goals.itinerary = planned  # type: ignore[assignment]
         try:
@@ -345,7 +345,7 @@ def driver(crew: RecordLayout, groups: int, names: Sequence[str], *, often: bool
             note=each("note({}, ledger)"),
         )
         try:
-            text = known.program.entry(source, vars(company), (crew, *GIVEN))
+            text = known.program.entry(source, vars(tick), (crew, *GIVEN))
             (address,) = machine.machine(text, ["fly"], often=often)
         except Exception as error:  # noqa: BLE001 - of any plug-in and compiler: the run is flown without them
             named = isinstance(error, OutsideError | machine.NoCompilerError)

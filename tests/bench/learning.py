@@ -9,9 +9,9 @@ import numpy as np
 
 from experiments.file.document import load
 from experiments.learning.environment import Environment
-from experiments.virtual_time.company import Ledger
 from experiments.virtual_time.simulation import VirtualRun
 from experiments.virtual_time.stretch import Stretches
+from experiments.virtual_time.tick import Ledger
 from tests.bench.measuring import Figure, median
 
 SQUARE: Final = Path(__file__).parents[2] / "docs" / "learning_square.toml"

@@ -50,7 +50,7 @@ class Served:
         capture, wrong = Capture(), Faults(**faults)
 
         def told():
-            position, yaw, turn = capture.told(wrong, time.monotonic() - self.zero, *self.truth())
+            position, yaw, turn = capture.measured(wrong, time.monotonic() - self.zero, *self.truth())
             return position, yaw + turn
 
         return told

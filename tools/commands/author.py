@@ -148,8 +148,8 @@ def mark(
     from experiments.course.marking import DEFAULT, SOLUTION, marks
 
     known = read_course(origin or OURS)
-    if unknown := next((name for name in only or [] if name not in known.exercises), None):
-        raise CourseError(f"no exercise '{unknown}'; {did_you_mean(unknown, known.exercises)}")
+    if stranger := next((name for name in only or [] if name not in known.exercises), None):
+        raise CourseError(f"no exercise '{stranger}'; {did_you_mean(stranger, known.exercises)}")
     asked = {name: each for name, each in known.exercises.items() if not only or name in only}
     first = secrets.randbelow(1_000_000) if seed is None else seed
     found = []

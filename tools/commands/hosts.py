@@ -128,10 +128,10 @@ def install(file: File, settings: Settings = None, on: On = None, lab: Lab = Non
     chosen = {name: host for name, host in choose(experiment.hosts, on or []).items() if host.address is not None}
     shown: list[dict[str, str | bool]] = []
     with stations(read, chosen, lab, routed=False) as found:
-        for (name, host), there in zip(chosen.items(), found, strict=True):
+        for (name, host), station in zip(chosen.items(), found, strict=True):
             row: dict[str, str | bool] = {"host": name, "ok": True}
             shown.append(row)
-            same = not isinstance(there, HostError) and there.same_version
+            same = not isinstance(station, HostError) and station.same_version
             own = version.digest()[: version.DIGEST_CHARACTERS]
             try:
                 row["zenpark"] = f"has it already ({own})" if same else put(name, host)
@@ -139,7 +139,7 @@ def install(file: File, settings: Settings = None, on: On = None, lab: Lab = Non
                     print(f"{name}: {row['zenpark']}", flush=True)
                 if folder is not None and host.robots:
                     robots = certificates.of_host(name, experiment.hosts)
-                    right = not isinstance(there, HostError) and same and _has_certificates(there, folder, robots)
+                    right = not isinstance(station, HostError) and same and _has_certificates(station, folder, robots)
                     row["certificates"] = "has its certificates" if right else send(name, host, folder, robots)
                     if not as_json:
                         print(f"{name}: {row['certificates']}")
@@ -163,11 +163,11 @@ def choose(hosts: Mapping[str, Host], only: Sequence[str]) -> dict[str, Host]:
     return {name: host for name, host in hosts.items() if not wanted or {name, *host.tags} & {*wanted}}
 
 
-def _has_certificates(there: Station, folder: Path, robots: Sequence[str]) -> bool:
+def _has_certificates(station: Station, folder: Path, robots: Sequence[str]) -> bool:
     """Whether a host holds the certificates of its robots, and no others."""
     from experiments.real_time.hosts import certificates
 
-    content = there.folder_content(robots)
+    content = station.folder_content(robots)
     return not (
         content.others or [*certificates.faults(content, folder, time.time()), *certificates.ended(folder, robots)]
     )
@@ -218,68 +218,68 @@ def stations(
         yield found
 
 
-def _row(there: Station | HostError, plan: Plan) -> HostRow:
+def _row(station: Station | HostError, plan: Plan) -> HostRow:
     """Everything about one host."""
     from experiments.real_time.hosts.hosts import HostError
 
-    if isinstance(there, HostError):
-        return HostRow({"host": str(there).partition(":")[0], "reachable": NO}, [str(there)])
-    row = HostRow({"host": there.name, "reachable": f"{YES} {there.hello.machine}"})
+    if isinstance(station, HostError):
+        return HostRow({"host": str(station).partition(":")[0], "reachable": NO}, [str(station)])
+    row = HostRow({"host": station.name, "reachable": f"{YES} {station.hello.machine}"})
     try:
-        _fill(row, there, plan)
+        _fill(row, station, plan)
     except HostError as error:
         row.blank = NO
         row.trouble.append(str(error))
     return row
 
 
-def _fill(row: HostRow, there: Station, plan: Plan) -> None:
+def _fill(row: HostRow, station: Station, plan: Plan) -> None:
     from experiments.real_time.hosts.station import Question
     from experiments.recording import version
 
     here = version.digest()[: version.DIGEST_CHARACTERS]
     row.cells["zenpark"] = f"{YES} {here}"
-    if not there.same_version:
-        row.cells["zenpark"] = f"{NO} {there.hello.zenpark[: version.DIGEST_CHARACTERS]}, here {here}"
+    if not station.same_version:
+        row.cells["zenpark"] = f"{NO} {station.hello.zenpark[: version.DIGEST_CHARACTERS]}, here {here}"
         row.trouble.append(
-            f"{there.name}: another zenpark is there; `./zenpark hosts install FILE` puts this one there"
+            f"{station.name}: another zenpark is there; `./zenpark hosts install FILE` puts this one there"
         )
-    row.cells["Python"] = f"{YES} {there.hello.python}"
-    clock = there.measure()
+    row.cells["Python"] = f"{YES} {station.hello.python}"
+    clock = station.measure()
     vague = clock.uncertainty > VAGUE_S
     offset = f"{clock.offset * 1e3:+.2f} ± {clock.uncertainty * 1e3:.2f} ms"
     row.cells["clock"] = f"{DOUBTFUL if vague else YES} {offset}"
     if vague:
         row.trouble.append(
-            f"{there.name}: the connection is slow, so robots there may start ± {clock.uncertainty * 1e3:.0f} ms apart "
-            "from the others; use a cable, or a network with less on it"
+            f"{station.name}: the connection is slow, so robots there may start ± {clock.uncertainty * 1e3:.0f} ms "
+            "apart from the others; use a cable, or a network with less on it"
         )
-    bodies = [plan.experiment.robots[robot].body for robot in there.host.robots]
-    devices = there.ask(Question("devices", bodies=bodies), REACH_S)[0].found
+    bodies = [plan.experiment.robots[robot].body for robot in station.host.robots]
+    devices = station.ask(Question("devices", bodies=bodies), REACH_S)[0].found
     wrong = [each for each in devices if not each.well]
     words = ", ".join(each.what for each in devices) or "none needed"
     row.cells["devices"] = f"{NO if wrong else YES} {words}"
-    row.trouble += [f"{there.name}: {each.what} {each.text}" for each in wrong]
-    if there.lab is not None and not _recognised(row, there, there.lab, plan):
+    row.trouble += [f"{station.name}: {each.what} {each.text}" for each in wrong]
+    if station.lab is not None and not _recognised(row, station, station.lab, plan):
         row.cells["router"] = f"{NOTHING} needs its certificates"
         return
-    lab: dict[str, Any] = {} if there.lab is None else {"lab": there.folder, "names": there.host.robots}
-    routers = there.ask(Question("reach", endpoints=there.endpoints, **lab), REACH_S)[0].found
+    lab: dict[str, Any] = {} if station.lab is None else {"lab": station.folder, "names": station.host.robots}
+    routers = station.ask(Question("reach", endpoints=station.endpoints, **lab), REACH_S)[0].found
     unreached = [each for each in routers if not each.well]
     reached = ", ".join(each.text for each in routers if each.well)
     row.cells["router"] = f"{NO if unreached else YES} {reached}".rstrip()
     row.trouble += [
-        f"{there.name}: {each.what} cannot be reached from there; {_router_remedy(there, each, plan)}"
+        f"{station.name}: {each.what} cannot be reached from there; {_router_remedy(station, each, plan)}"
         for each in unreached
     ]
 
 
-def _router_remedy(there: Station, router: HostCheck, plan: Plan) -> str:
+def _router_remedy(station: Station, router: HostCheck, plan: Plan) -> str:
     """Remedy for a router that a host does not reach."""
     from agents.network.endpoints import Endpoint
 
     if "refuses the certificate" in router.text and Endpoint.parse(router.what).is_loopback:
-        return f"ssh carries it, so look at the certificates: `./zenpark lab show {there.lab}`"
+        return f"ssh carries it, so look at the certificates: `./zenpark lab show {station.lab}`"
     if plan.experiment.network.connect is not None:
         return "is it on (`./zenpark router` starts one)? Else mend connect in [network]"
     if plan.experiment.network.listen is not None:
@@ -287,19 +287,19 @@ def _router_remedy(there: Station, router: HostCheck, plan: Plan) -> str:
     return "ssh carries it: does sshd there allow that (AllowTcpForwarding yes)? Else add listen to [network]"
 
 
-def _recognised(row: HostRow, there: Station, folder: Path, plan: Plan) -> bool:
+def _recognised(row: HostRow, station: Station, folder: Path, plan: Plan) -> bool:
     """Add what a host holds of the lab's certificates to its row; whether its robots would be let in."""
     from experiments.real_time.hosts import certificates
 
-    wrong = there.distrusted(there.host.robots)
-    content = there.folder_content(certificates.of_host(there.name, plan.experiment.hosts))
-    misplaced_keys = [f"{there.name}: {each}" for each in certificates.misplaced_keys(content, there.name)]
-    left = certificates.days_left(folder, there.host.robots)
+    wrong = station.distrusted(station.host.robots)
+    content = station.folder_content(certificates.of_host(station.name, plan.experiment.hosts))
+    misplaced_keys = [f"{station.name}: {each}" for each in certificates.misplaced_keys(content, station.name)]
+    left = certificates.days_left(folder, station.host.robots)
     soon = not wrong and left < SOON_DAYS
     mark = NO if wrong or misplaced_keys else DOUBTFUL if soon else YES
     row.cells["certificates"] = f"{mark} {len(content.identities)}, {left:.0f} days left" if not wrong else mark
     row.trouble += [*wrong, *misplaced_keys]
     if soon:
-        remedy = f"`./zenpark lab renew {folder} {' '.join(there.host.robots)}`, then `./zenpark hosts install FILE`"
-        row.trouble.append(f"{there.name}: its certificates end in {left:.0f} days; {remedy}")
+        remedy = f"`./zenpark lab renew {folder} {' '.join(station.host.robots)}`, then `./zenpark hosts install FILE`"
+        row.trouble.append(f"{station.name}: its certificates end in {left:.0f} days; {remedy}")
     return not wrong

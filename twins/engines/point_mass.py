@@ -45,8 +45,8 @@ def has_model(kind: Kind) -> bool:
 
 def require_models(kinds: Iterable[Kind]) -> None:
     """Raises BodyError for a kind without a model."""
-    if unknown := sorted({kind.name for kind in kinds if not has_model(kind)}):
-        raise BodyError(f"no twin of {', '.join(map(repr, unknown))}; {TWINLESS}")
+    if modelless := sorted({kind.name for kind in kinds if not has_model(kind)}):
+        raise BodyError(f"no twin of {', '.join(map(repr, modelless))}; {TWINLESS}")
 
 
 def model(kind: Kind, start: Vector, yaw: float) -> Motion:

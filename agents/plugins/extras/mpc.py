@@ -83,8 +83,10 @@ class Mpc(Law, frozen=True):
         conflicts, slack = [], 0.0
         a = ahead.rest
         if view.moves and not view.leads:
-            mine = ahead.later(memory["path"], view.step_s) if is_known(memory["path"]) else ahead.positions(p, v, a)
-            conflicts = ahead.conflicts(mine, view.neighbours, self.spacing, self.right)
+            own_path = (
+                ahead.later(memory["path"], view.step_s) if is_known(memory["path"]) else ahead.positions(p, v, a)
+            )
+            conflicts = ahead.conflicts(own_path, view.neighbours, self.spacing, self.right)
             goal = self.goal.get(view.robot.name, p)
             a, slack = ahead.plan(p, v, goal, conflicts, (speed, self.acceleration, self.penalty))
         path, (ax, ay) = ahead.positions(p, v, a), a[0].tolist()
@@ -160,27 +162,27 @@ class Horizon:
         return found
 
     def conflicts(
-        self, mine: Array, neighbours: Iterable[NeighbourView], spacing: float, right: float
+        self, own_path: Array, neighbours: Iterable[NeighbourView], spacing: float, right: float
     ) -> list[tuple[int, Planar, float]]:
         """Constraints n·p ≥ b at the first step at which a plan comes too near to another: step, n and b."""
         np = self._np
         paths = [
             self.later(each.said["path"], each.age)
             if is_known(each.said["path"])
-            else np.broadcast_to(np.array(each.position[:2]), mine.shape)
+            else np.broadcast_to(np.array(each.position[:2]), own_path.shape)
             for each in neighbours
         ]
         if not paths:
             return []
-        theirs = np.array(paths)
-        apart = np.hypot(*np.moveaxis(mine - theirs, 2, 0))
+        other_paths = np.array(paths)
+        apart = np.hypot(*np.moveaxis(own_path - other_paths, 2, 0))
         too_near = (apart < spacing).any(axis=0)
         if not too_near.any():
             return []
         step, found = int(too_near.argmax()), []
-        for (x, y), distance in zip(theirs[:, step].tolist(), apart[:, step].tolist(), strict=True):
+        for (x, y), distance in zip(other_paths[:, step].tolist(), apart[:, step].tolist(), strict=True):
             if distance < AROUND * spacing:
-                dx, dy = (mine[step] - (x, y)).tolist() if distance > TOGETHER else (1.0, 0.0)
+                dx, dy = (own_path[step] - (x, y)).tolist() if distance > TOGETHER else (1.0, 0.0)
                 size = hypot(dx, dy)
                 nx, ny = (dx * cos(right) - dy * sin(right)) / size, (dx * sin(right) + dy * cos(right)) / size
                 found.append((step, (nx, ny), nx * x + ny * y + spacing))

@@ -53,9 +53,9 @@ class Averaging(Law, frozen=True):
         """Whether the steps of the estimator bear its gains on these links, and how soon it settles."""
         pairs = set(zip(plan.links.receiver.tolist(), plan.links.sender.tolist(), strict=True))
         for receiver, sender in sorted((i, j) for i, j in pairs if (j, i) not in pairs)[:1]:
-            there, here = plan.names[sender], plan.names[receiver]
-            message = f"{here} receives {there}, but not the other way: the robots do not agree on the average"
-            yield "error", message, f'link both ways, as "{there} - {here}"'
+            sender_name, here = plan.names[sender], plan.names[receiver]
+            message = f"{here} receives {sender_name}, but not the other way: the robots do not agree on the average"
+            yield "error", message, f'link both ways, as "{sender_name} - {here}"'
             return
         step = 1.0 / plan.experiment.rates.coordination_hz
         count = max(round(plan.talk_period_s / step), 1)

@@ -152,9 +152,9 @@ def transition(t: float, density: float, every: Values) -> tuple[Matrix, Matrix]
     c = density * t
     noise = ((a, 0.0, b, 0.0), (0.0, a, 0.0, b), (b, 0.0, c, 0.0), (0.0, b, 0.0, c))
     back = ((1.0, 0.0, -t, 0.0), (0.0, 1.0, 0.0, -t), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-    there = transposed(back)
-    discount = inverse(plus(IDENTITY, product(product(product(there, rows(every)), back), noise)))
-    return product(discount, there), back
+    forward = transposed(back)
+    discount = inverse(plus(IDENTITY, product(product(product(forward, rows(every)), back), noise)))
+    return product(discount, forward), back
 
 
 def rows(numbers: Sequence[float]) -> Matrix:

@@ -155,9 +155,9 @@ class Drones:
         self._dt, self._ticks = dt, max(1, math.ceil(dt * RATE_HZ - 1e-6))
         self._period = dt / self._ticks
         frames = [kind.airframe for kind in kinds if kind.airframe is not None]
-        if unknown := sorted({kind.name for kind in kinds if kind.airframe is None}):
+        if frameless := sorted({kind.name for kind in kinds if kind.airframe is None}):
             remedy = "give the kind an `airframe` (docs/plugins.md), or choose another engine"
-            raise BodyError(f"the engine mujoco has no airframe of {', '.join(map(repr, unknown))}; {remedy}")
+            raise BodyError(f"the engine mujoco has no airframe of {', '.join(map(repr, frameless))}; {remedy}")
         step = self._period / SUBSTEPS
         models = {frame: mujoco.MjModel.from_xml_string(mjcf(frame, scene, step, motor_lag)) for frame in frames}
         self._models = [models[frame] for frame in frames]

@@ -172,8 +172,8 @@ def calibrate(
         if time.monotonic() > deadline:
             raise CalibrationError(f"no images: {images.troubles}")
     measured = {}
-    for name, its in corners.items():
-        seen = {number: np.median(found, axis=0) for number, found in its.items() if len(found) > counts[name] // 2}
+    for name, tags in corners.items():
+        seen = {number: np.median(found, axis=0) for number, found in tags.items() if len(found) > counts[name] // 2}
         measured[name], error = hang(name, seen, lab.floor, lenses[name])
         x, y, z = measured[name].place
         kind = ", tags of the AprilTag project" if measured[name].half_turn else ""

@@ -92,7 +92,8 @@ class CaptureTwin(Server):
         self._rotation = np.repeat(np.eye(3)[None], len(self._bodies), axis=0)
         self._visible = np.zeros(len(self._bodies), dtype=bool)
         self.latency_s = 0.0
-        self._told: tuple[CaptureFault, int, float] = "", 0, 0.0  # fault of the last frame, its subject and its size
+        # fault of the last frame, its subject and its size
+        self._fault: tuple[CaptureFault, int, float] = "", 0, 0.0
         self._capture = Capture(self._rng)
         self._last: tuple[int, list[SeenBody]] = 0, []  # number and bodies of the last frame without a fault
         self._overtaken: bytes | None = None  # frame that the next one overtakes
@@ -120,9 +121,9 @@ class CaptureTwin(Server):
             self._deliver(frame)
 
     def _send_frame(self, t: float) -> None:
-        before, self._told = self._told, self.link.faults.captured(t)
-        fault, subject, _ = self._told
-        if before != self._told and "renamed" in (before[0], fault):
+        before, self._fault = self._fault, self.link.faults.captured(t)
+        fault, subject, _ = self._fault
+        if before != self._fault and "renamed" in (before[0], fault):
             self._rename()
         if fault not in ("frozen", "repeated"):
             swapped = [subject, subject + 1] if fault == "swapped" else []
@@ -148,14 +149,15 @@ class CaptureTwin(Server):
     def _names(self) -> list[str]:
         """Names of the bodies now."""
         names = list(self._bodies)
-        fault, subject, _ = self._told
+        fault, subject, _ = self._fault
         if fault == "renamed":
             names[subject % len(names)] += "-renamed"
         return names
 
     def _poses(self, t: float, swapped: Sequence[int]) -> list[SeenBody]:
         """Poses of all bodies, of which two may be swapped."""
-        position, rotation, turn = self._capture.told(self.link.faults, t, self._position.copy(), self._rotation.copy())
+        position, rotation = self._position.copy(), self._rotation.copy()
+        position, rotation, turn = self._capture.measured(self.link.faults, t, position, rotation)
         if self._sigma > 0.0:
             position = position + self._rng.normal(0.0, self._sigma, position.shape)
         rows = list(range(len(self._bodies)))

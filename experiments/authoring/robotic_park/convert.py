@@ -143,16 +143,18 @@ def _calm(tables: Mapping[str, dict[str, Any]], gain: float, *, lower: bool) -> 
     share, formation = CALM * OSCILLATING_GAIN / gain, tables["formation"]
     owners = [formation, *tables["formation.links"].values(), *tables["formation.anchors"].values()]
     key = "gain" if "gain" in formation else "stiffness"
-    theirs, most = formation[key], _rounded(share * formation[key])
+    written, most = formation[key], _rounded(share * formation[key])
     rings = "swings for ever" if gain >= UNSTABLE_GAIN else "oscillates before it settles"
     loop = f"with zenpark's twins the sampled loop {rings} (gain {gain:.2g}, limit {UNSTABLE_GAIN:g})"
     if not lower:
-        return f"{key} {theirs:g}: {loop}. At most {most:g} is calm: `--gain stable` writes it, and lowers all gains so"
+        return (
+            f"{key} {written:g}: {loop}. At most {most:g} is calm: `--gain stable` writes it, and lowers all gains so"
+        )
     for owner in owners:
         for name in ("gain", "stiffness"):
             if isinstance(owner, dict) and name in owner:
                 owner[name] = _rounded(share * owner[name])
-    return f"{key} {theirs:g} of theirs is {most:g}, and all others are lowered as much: with theirs, {loop}"
+    return f"{key} {written:g} of theirs is {most:g}, and all others are lowered as much: with theirs, {loop}"
 
 
 def _rounded(gain: float) -> float:
@@ -215,7 +217,7 @@ def _notes_on_robots(park: ParkExperiment) -> Iterator[str]:
         "{}: position controllers that act on events; zenpark's run at every tick": waiting,
         f"task.enable is False for {{}}: {left} relations are left out, and these robots have no neighbours": idle,
     }
-    yield from (note.format(join_names([robot.name for robot in those])) for note, those in rows.items() if those)
+    yield from (note.format(join_names([robot.name for robot in group])) for note, group in rows.items() if group)
     triggers = [robot.communication for robot in robots] + [task.controller for _, task in park.tasks]
     if types := sorted({each.threshold.type for each in triggers if each.event} - {"Constant"}):
         yield f"threshold.type: {', '.join(types)}; taken as a constant one with what ai adds"
@@ -260,8 +262,8 @@ def _formation(
     jobs = park.tasks
     if not jobs:
         return {"law": "distance"}, {}, {}
-    if unknown := dict.fromkeys(task.law for _, task in jobs if task.law not in ("gradient", "pid")):
-        notes.append(f"task.controller.type: {', '.join(unknown)}; taken as gradient")
+    if foreign_laws := dict.fromkeys(task.law for _, task in jobs if task.law not in ("gradient", "pid")):
+        notes.append(f"task.controller.type: {', '.join(foreign_laws)}; taken as gradient")
     kept = [relation for _, task in jobs if task.kind == "distance" for relation in task.relations]
     distances = [relation.values[0] for relation in kept if relation.name not in PLACES]
     mean = float(np.mean(distances)) if distances else 1.0

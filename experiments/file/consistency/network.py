@@ -132,11 +132,11 @@ def channel_faults(plan: Plan) -> Iterator[Fault]:
     """All contradictions in [channel]."""
     experiment, channel = plan.experiment, plan.experiment.channel
     yield from _bursts(channel, ("channel",), channel)
-    there = _pose_pairs(plan) if channel.links or any(outage.links for outage in channel.outages) else None
+    linked = _pose_pairs(plan) if channel.links or any(outage.links for outage in channel.outages) else None
     given: dict[tuple[str, str], str] = {}
     for text, own in channel.links.items():
         path = (*AT, text)
-        yield from _link(experiment, there, text, path, on_key=True)
+        yield from _link(experiment, linked, text, path, on_key=True)
         yield from _bursts(link_effects(channel, own), path, own)
         for pair in pairs_or_none(text):
             if pair in given:
@@ -148,13 +148,13 @@ def channel_faults(plan: Plan) -> Iterator[Fault]:
         where = ("channel", "outages", number)
         yield from after_the_end((*where, "from_s"), "outage", outage.from_s, experiment.duration_s)
         for k, text in enumerate(outage.links):
-            yield from _link(experiment, there, text, (*where, "links", k))
+            yield from _link(experiment, linked, text, (*where, "links", k))
         for k, robot in enumerate(outage.robots):
             yield from unknown_robot((*where, "robots", k), robot, experiment.robots)
 
 
 def _link(
-    experiment: Experiment, there: set[tuple[str, str]] | None, text: str, path: Path, *, on_key: bool = False
+    experiment: Experiment, linked: set[tuple[str, str]] | None, text: str, path: Path, *, on_key: bool = False
 ) -> Iterator[Fault]:
     """Faults of a text that names a link on which poses are sent; `there` are all of those, if known."""
     both = pairs_or_none(text)
@@ -166,7 +166,7 @@ def _link(
         yield from unknown_robot(path, name, experiment.robots, on_key=on_key)
     if not names.keys() <= experiment.robots.keys():
         return
-    absent = [pair for pair in both if there is not None and pair not in there]
+    absent = [pair for pair in both if linked is not None and pair not in linked]
     if absent:
         receiver, sender = absent[0]
         hint = f"leave it out, or add the link to [formation.links]; {FORM}"

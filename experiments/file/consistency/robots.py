@@ -39,7 +39,7 @@ def robot_faults(experiment: Experiment, engine: EngineFactory) -> Iterator[Faul
         yield from _start(experiment, path, robot)
         kind = kinds.get(robot.kind)
         if kind is None:
-            yield _unknown(path, robot.kind)
+            yield _unknown_kind(path, robot.kind)
         else:
             yield from _hover(experiment, path, robot, kind)
         yield from _body(engine, path, robot, kind)
@@ -146,7 +146,7 @@ def _start(experiment: Experiment, path: tuple[str, str], robot: RobotTable) -> 
         yield Fault((*path, "start", 2), "the yaw is in radians", f"{robot.start[2]:g} degrees are {radians:.4f}")
 
 
-def _unknown(path: tuple[str, str], name: str) -> Fault:
+def _unknown_kind(path: tuple[str, str], name: str) -> Fault:
     try:
         KINDS[name]
     except registry.PluginError as error:

@@ -249,9 +249,9 @@ class CaseProcesses:
             return f"the parts of the recording are not joined: {error}"
         return ""
 
-    def adopt(self, there: Iterable[str]) -> list[str]:
-        """Adopt robots that are `there`, and those of hosts without address, which are not started; returns all."""
-        self.adopted = {*there, *self.away}
+    def adopt(self, robots: Iterable[str]) -> list[str]:
+        """Adopt `robots` that are there, and those of hosts without address, which are not started; returns all."""
+        self.adopted = {*robots, *self.away}
         return sorted(self.adopted)
 
     def start(self, only: Collection[str] | None = None, changed: Mapping[str, RobotTable] | None = None) -> None:

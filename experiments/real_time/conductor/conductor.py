@@ -155,9 +155,9 @@ class Conductor(CaseRun):
                 f"{', '.join(flown)}: on the network already, and {self._robots[flown[0]].phase}; a robot that was "
                 "started by hand flies once: end its process and start it again, next time with --once"
             )
-        there = {name for name, view in self._robots.items() if view.alive}
-        for name in self._processes.adopt(there):
-            state = f"is there already, {self._robots[name].phase}" if name in there else f"is started on {away[name]}"
+        alive = {name for name, view in self._robots.items() if view.alive}
+        for name in self._processes.adopt(alive):
+            state = f"is there already, {self._robots[name].phase}" if name in alive else f"is started on {away[name]}"
             self._view.report("adopted", name, f"{state}; not started from here")
 
     def _flown(self) -> list[str]:
@@ -242,10 +242,10 @@ class Conductor(CaseRun):
             if not view.gone and view.clock_off:
                 off = f"its clock is {-view.clock_off:+.2f} s off and it will start so"
                 self._view.report("clock", name, f"{off}; set it (NTP), or let zenpark start the robot: [hosts]")
-        there = [name for name, view in self._robots.items() if view.reached("airborne") and not view.gone]
-        at = self._clock.utc() + start_lead_s(len(there))
+        ready = [name for name, view in self._robots.items() if view.reached("airborne") and not view.gone]
+        at = self._clock.utc() + start_lead_s(len(ready))
         self._view.report("start", "conductor", "common start", stamp=at)
-        self._order(messages.Order("start", at=at), there)
+        self._order(messages.Order("start", at=at), ready)
         self._starting = {name for name, view in self._robots.items() if not view.gone}
         return at
 

@@ -155,8 +155,8 @@ class HotChanges:
     def _refusals(self, order: messages.RunOrder) -> Iterator[str]:
         """Reasons to refuse the whole order."""
         known = self._robots
-        if (unknown := next((name for name in order.robots if name not in known), None)) is not None:
-            yield f"no robot '{unknown[:50]}' in this run; {did_you_mean(unknown[:50], known)}"
+        if (stranger := next((name for name in order.robots if name not in known), None)) is not None:
+            yield f"no robot '{stranger[:50]}' in this run; {did_you_mean(stranger[:50], known)}"
         if not order.robots:
             yield f"name one or more of {', '.join(known)}"
         if self._start is None:
@@ -220,21 +220,21 @@ class HotChanges:
     def _leave(self, names: Sequence[str]) -> Generator[None]:
         """Robots land and leave the network; their process ends if no other robot needs it."""
         processes = self._processes
-        there = [name for name in names if self._robots[name].alive or processes.runs(name)]
+        present = [name for name in names if self._robots[name].alive or processes.runs(name)]
         together = processes.companions(names[0])
         staying = [other for other in together if other not in names and not self._robots[other].gone]
         kept = f"shares its process with {', '.join(staying)}: name them all" if staying else ""
-        if any(name in processes.adopted for name in there):
+        if any(name in processes.adopted for name in present):
             kept = "was not started from here: end its process where it runs"
-        self._leaving |= {*there}
-        for name, reply in self._view.order(there, messages.Order("leave")).items():
+        self._leaving |= {*present}
+        for name, reply in self._view.order(present, messages.Order("leave")).items():
             if not reply.ok and kept:
                 raise Refusal(f"{name} does not answer, and {kept}")
             if not reply.ok:
                 self._view.report("silent", name, f"does not answer ({reply.reason}): its lifeline is cut")
                 processes.release(name)
         began, killed = time.monotonic(), False
-        while still := [name for name in there if self._robots[name].alive or (processes.runs(name) and not staying)]:
+        while still := [name for name in present if self._robots[name].alive or (processes.runs(name) and not staying)]:
             past = time.monotonic() - began
             if past > LAND_S and kept:
                 raise Refusal(f"{', '.join(still)}: ordered to land, but still there after {LAND_S:g} s; it {kept}")
@@ -390,8 +390,8 @@ class Spares:
     def _of_spare(self, spare: str, name: str, robot: RobotTable) -> RobotTable:
         spares = self._spares
         if spare not in spares:
-            there = did_you_mean(spare[:50], spares) if spares else "the file has none"
-            raise Refusal(f"no spare '{spare[:50]}'; {there}")
+            hint = did_you_mean(spare[:50], spares) if spares else "the file has none"
+            raise Refusal(f"no spare '{spare[:50]}'; {hint}")
         if spare in self.used:
             raise Refusal(f"{spare} has taken over {self.used[spare]} already")
         if spares[spare].kind != robot.kind:

@@ -140,7 +140,7 @@ def stop_publisher(session: zenoh.Session, keys: Keys) -> zenoh.Publisher:
 def alive(session: zenoh.Session, keys: Keys) -> set[str]:
     """Robots that are on the network."""
     replies = session.liveliness().get(keys.alive("*"), timeout=STOP_ANSWER_S)
-    found = {keys.whose(str(reply.ok.key_expr)) for reply in replies if reply.ok is not None}
+    found = {keys.robot_of(str(reply.ok.key_expr)) for reply in replies if reply.ok is not None}
     return {robot for robot in found if robot is not None}
 
 
@@ -246,9 +246,9 @@ class EmergencyStop:
             ):
                 urgent.put(payload)
                 time.sleep(STOP_AGAIN_S)
-                for token, there in watch.changes():
-                    robot = keys.whose(token)
-                    if robot is not None and there and robot not in self.seen:
+                for token, stands in watch.changes():
+                    robot = keys.robot_of(token)
+                    if robot is not None and stands and robot not in self.seen:
                         self.seen.add(robot)
                         self.moving.add(robot)
                 for status in inbox.read():

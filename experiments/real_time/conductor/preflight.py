@@ -132,8 +132,8 @@ class Inspector(CaseRun):
         self._states = {name: each.states for name, each in observed.items()}
         deadline = time.monotonic() + SAMPLE_S
         while time.monotonic() < deadline and not self._context.ended():
-            there = [name for name, seen in self._robots.items() if seen.status is not None and name not in self._ended]
-            for name, inspection in self._inspect(there):
+            heard = [name for name, view in self._robots.items() if view.status is not None and name not in self._ended]
+            for name, inspection in self._inspect(heard):
                 observed[name].inspections.append(inspection)
             self._wait(INSPECT_S, lambda: False)
         for name, each in observed.items():

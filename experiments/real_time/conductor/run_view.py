@@ -201,9 +201,9 @@ class NetworkView:
                 f"this process stood still for more than {SILENCE_S:g} s; its robots have landed without it, and get "
                 "no further order: robots of these names may belong to another run now"
             )
-        for _, there in self._recorder_watch.changes():
-            self.recording_begun |= there
-            self._recorder_vanished = inf if there else time.monotonic()
+        for _, stands in self._recorder_watch.changes():
+            self.recording_begun |= stands
+            self._recorder_vanished = inf if stands else time.monotonic()
         for status in self._feed.statuses.read():
             self.receive_status(status)
         self._progress.states = list(self._feed.states.read())
@@ -213,9 +213,9 @@ class NetworkView:
             view.behind = min(view.behind, arrived - state.stamp)
             view.error = state.error if view.linked else None
             view.place = state.true_position or state.position or view.place
-        for name, there in self._feed.alive():
+        for name, stands in self._feed.alive():
             if (known := self.robots.get(name)) is not None:
-                known.alive, known.vanished = there, inf if there else time.monotonic()
+                known.alive, known.vanished = stands, inf if stands else time.monotonic()
         now = time.monotonic()
         self._watch_router(now)
         # with another router, a token comes back at once

@@ -86,8 +86,8 @@ def issue(folder: Path, identities: Mapping[str, Role], *, hosts: Sequence[str] 
     Raises LabError if one is there already, or the authority's key is not on this machine.
     """
     known = register(folder)
-    if there := [name for name in identities if name in known.identities]:
-        raise LabError(f"{', '.join(there)}: in the lab already; `./zenpark lab renew` or `revoke` makes new files")
+    if present := [name for name in identities if name in known.identities]:
+        raise LabError(f"{', '.join(present)}: in the lab already; `./zenpark lab renew` or `revoke` makes new files")
     return _issued(_opened(folder), known, {name: Identity(role, name, "", "") for name, role in identities.items()},
                    hosts=hosts, days=days)  # fmt: skip
 
@@ -124,8 +124,8 @@ def revoke(folder: Path, names: Sequence[str], *, days: float = DAYS) -> Registe
 
 
 def _named(known: Register, names: Iterable[str]) -> dict[str, Identity]:
-    if unknown := [name for name in names if name not in known.identities]:
-        raise LabError(f"{', '.join(unknown)}: not in this lab, which knows {', '.join(known.identities)}")
+    if strangers := [name for name in names if name not in known.identities]:
+        raise LabError(f"{', '.join(strangers)}: not in this lab, which knows {', '.join(known.identities)}")
     return {name: known.identities[name] for name in names}
 
 

@@ -116,7 +116,7 @@ def days_left(folder: Path, names: Sequence[str]) -> float:
     return (min(ends) - datetime.now(UTC)).total_seconds() / 86400.0 if ends else 0.0
 
 
-def faults(found: FolderContent, folder: Path, there: float) -> Iterator[str]:
+def faults(found: FolderContent, folder: Path, host_utc: float) -> Iterator[str]:
     """Faults of the certificates of a machine with its clock at `there` [s, UTC], each with its remedy.
 
     `folder` is that of the lab on this machine, with its register and `ca.pem`.
@@ -127,11 +127,11 @@ def faults(found: FolderContent, folder: Path, there: float) -> Iterator[str]:
     if not found.authority:
         yield f"has no certificates of {names}; {INSTALL}"
         return
-    theirs, ours = fingerprint(found.authority), fingerprint(_text(folder / f"{AUTHORITY}.pem"))
-    if theirs != ours:
+    found_print, own_print = fingerprint(found.authority), fingerprint(_text(folder / f"{AUTHORITY}.pem"))
+    if found_print != own_print:
         yield (
             f"its certificates are of another lab, or of an authority that has been renewed since (ca.pem "
-            f"{theirs[:FINGERPRINT_DIGITS]}, here {ours[:FINGERPRINT_DIGITS]}); {INSTALL}"
+            f"{found_print[:FINGERPRINT_DIGITS]}, here {own_print[:FINGERPRINT_DIGITS]}); {INSTALL}"
         )
         return
     known = register(folder)
@@ -152,8 +152,8 @@ def faults(found: FolderContent, folder: Path, there: float) -> Iterator[str]:
             same = any(attribute.value == registered.common_name for attribute in certificate.subject)
             what = "renewed" if same else "revoked"
             yield f"the certificate of {each.name} there has been {what} since; {INSTALL}"
-        elif not certificate.not_valid_before_utc.timestamp() < there < certificate.not_valid_after_utc.timestamp():
-            now = datetime.fromtimestamp(there, UTC)
+        elif not certificate.not_valid_before_utc.timestamp() < host_utc < certificate.not_valid_after_utc.timestamp():
+            now = datetime.fromtimestamp(host_utc, UTC)
             yield f"its clock says {now:%Y-%m-%d %H:%M} UTC, when {each.name} has no valid certificate; set it (NTP)"
 
 

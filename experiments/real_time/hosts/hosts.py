@@ -131,7 +131,7 @@ class Station:
 
     def reset_clock(self) -> None:
         """Take the wall clock as it is now: a step of it in mid-run is no drift of the host's."""
-        self._ours = Clock()
+        self._clock = Clock()
         # applied: correction of that clock by its robots [s]
         self.applied, self._robots = 0.0, []
 
@@ -163,13 +163,13 @@ class Station:
             raise HostError(self._silent or self._broken())  # its end was noticed before
         deadline = time.monotonic() + limit_s
         text = msgspec.json.encode(question) + b"\n"
-        left = self._ours.utc()
+        left = self._clock.utc()
         # the output of ssh tells the reason; where the pipe is full, the station is silent
         with suppress(BrokenPipeError, BlockingIOError):
             os.write(self._out.fileno(), text)
         while self._waiting.poll(max(0.0, deadline - time.monotonic()) * 1e3):
             data = os.read(self._in.fileno(), 65536)
-            back = self._ours.utc()
+            back = self._clock.utc()
             if not data:
                 raise HostError(self._broken())
             *lines, self._rest = (self._rest + data).split(b"\n")

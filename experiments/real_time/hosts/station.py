@@ -140,9 +140,9 @@ def _other_processes() -> list[int]:
     This process, its parent, the zygote and those that stand for robots are left out: these end with the robots, or
     with this one.
     """
-    run, mine = os.environ.get(RUN), (os.getpid(), os.getppid())
+    run, own_pids = os.environ.get(RUN), (os.getpid(), os.getppid())
     found = tagged(f"{RUN}={run}") if run else []
-    return [pid for pid, words in found if pid not in mine and zygote.MODULE not in words]
+    return [pid for pid, words in found if pid not in own_pids and zygote.MODULE not in words]
 
 
 @contextlib.contextmanager

@@ -153,8 +153,8 @@ class CentreProcess:
         for row, publisher in self._memories.items():
             stepping = self.centre.robots[row].computer.stepping
             if stepping is not None:
-                told = messages.memory(self._names[row], self._seq, self._utc + t, stepping.memory, stepping.measures)
-                publisher.put(messages.encode(told, self._encoding))
+                memory = messages.memory(self._names[row], self._seq, self._utc + t, stepping.memory, stepping.measures)
+                publisher.put(messages.encode(memory, self._encoding))
 
     def _report(self, t: float) -> None:
         cpu_s = time.process_time()

@@ -142,14 +142,14 @@ class ConductorWatch:
         self._thread.join()
 
     def _watch_token(self) -> None:
-        there, missing_s = True, 0.0
+        stands, missing_s = True, 0.0
         try:
             while missing_s <= self._silence_s:
                 if self._over.wait(LOOK_S):
                     return
                 for _, alive in self._watch.changes():
-                    there = alive
-                missing_s = 0.0 if there or not network.connected(self._session) else missing_s + LOOK_S
+                    stands = alive
+                missing_s = 0.0 if stands or not network.connected(self._session) else missing_s + LOOK_S
             print("the conductor is gone", flush=True)
         finally:  # robots land whatever ends this watch, such as a terminal that is closed
             if not self._over.is_set():

@@ -56,8 +56,8 @@ class Recorder:
 
     def receive(self, *, last: bool = False) -> None:
         """Writes received messages; states of protocol twins wait for the next true pose, except the `last` time."""
-        for token, there in self._watch.changes():
-            (self.alive.add if there else self.alive.discard)(token)
+        for token, stands in self._watch.changes():
+            (self.alive.add if stands else self.alive.discard)(token)
         for truth in self._truths.read(_require_finite):
             self._store_truth(truth)
         for topic, inbox in self._inboxes:

@@ -82,10 +82,10 @@ def fly(launch: RobotLaunch) -> int:
         else:
             read = document.read(file)
         plan = chosen_case(read, launch.case)
-        unknown = [name for name in names if name not in plan.names]
-        if unknown:
-            hint = did_you_mean(unknown[0], plan.names)
-            raise refusal(file, f"no robot '{unknown[0]}' in this experiment", hint)
+        strangers = [name for name in names if name not in plan.names]
+        if strangers:
+            hint = did_you_mean(strangers[0], plan.names)
+            raise refusal(file, f"no robot '{strangers[0]}' in this experiment", hint)
         endpoints = router_endpoints(plan, read.path, endpoints, launch.lab) or [DEFAULT_ENDPOINT]
         return _run(plan, launch, endpoints)
 

@@ -201,10 +201,10 @@ def serve(launch: WorldLaunch) -> int:
         taken="a world runs",
     ) as joint:
         # before a watch of those tokens begins: a session that watches answers from what it has received
-        there = _alive(joint.session, joint.keys)
+        alive = _alive(joint.session, joint.keys)
         world = WorldProcess(plan, population, joint, lost)
         joint.declared.append(world)
-        back = world.states.restore(there)
+        back = world.states.restore(alive)
         for name, flying in back.items():
             world.commands.expect(name, flying=flying)
         mirrored = ", ".join(name for name in plan.names if name not in world.carried) or "none"
@@ -222,7 +222,7 @@ def serve(launch: WorldLaunch) -> int:
 def _alive(session: zenoh.Session, keys: Keys) -> set[str]:
     """Robots that are on the network already: a former world may have simulated them."""
     replies = session.liveliness().get(keys.alive("*"), timeout=1.0)
-    found = {keys.whose(str(reply.ok.key_expr)) for reply in replies if reply.ok is not None}
+    found = {keys.robot_of(str(reply.ok.key_expr)) for reply in replies if reply.ok is not None}
     return {name for name in found if name is not None}
 
 

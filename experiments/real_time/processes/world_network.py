@@ -100,8 +100,8 @@ class Commands:
         was_cut_off, self._cut_off = self._cut_off, self._router.silent_since(t) < inf
         if was_cut_off and not self._cut_off:
             self._ownership.begin(self._session)
-        for token, there in self._owners.changes():
-            if there:
+        for token, stands in self._owners.changes():
+            if stands:
                 self._note_owner(token)
         for command, sample in self._inbox.read_samples(validation.check_command, self._known):
             row = self._row[str(sample.key_expr)]
@@ -156,7 +156,7 @@ class Commands:
 
     def _note_owner(self, token: str) -> None:
         """A new process owns the name of a robot: it numbers commands by its own clock, which may be behind."""
-        name, life = self._keys.whose(token), Keys.life_of(token)
+        name, life = self._keys.robot_of(token), Keys.life_of(token)
         if name is None or life is None:
             return
         if self.lives.get(name, life) != life:
@@ -167,7 +167,7 @@ class Commands:
         """Whether a command is for a robot of this world; one that is for no robot of this system is refused."""
         if key in self._row or key in self._elsewhere:
             return key in self._row
-        name = self._keys.whose(key)
+        name = self._keys.robot_of(key)
         if name is None:
             self._events.malformed += 1
             return False
@@ -210,10 +210,10 @@ class States:
             [mirror.velocity for mirror in mirrors],
         )
 
-    def restore(self, there: Set[str]) -> dict[str, bool]:
+    def restore(self, stands: Set[str]) -> dict[str, bool]:
         """Places simulated robots that are `there` at the poses of their states: their names, and whether they fly."""
         carried = zip(self._names, self._population.carried, strict=True)
-        waiting = {name: self._states_of(name) for name, here in carried if here and name in there}
+        waiting = {name: self._states_of(name) for name, here in carried if here and name in stands}
         found: dict[str, bool] = {}
         deadline, pause = time.monotonic() + ANSWER_S, threading.Event()
         while waiting and time.monotonic() < deadline:

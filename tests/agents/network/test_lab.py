@@ -131,9 +131,9 @@ def test_unreachable_names_endpoints_and_remedy():
 def test_robots_and_sessions_own_keys():
     keys = Keys("park")
     alive = keys.alive("KH01")
-    assert keys.whose(keys.pose("KH01")) == keys.whose(alive) == "KH01"
+    assert keys.robot_of(keys.pose("KH01")) == keys.robot_of(alive) == "KH01"
     for key in ("**", "park/**", "lab/KH01/pose", "park", "park/", "park//pose", ""):
-        assert keys.whose(key) is None
+        assert keys.robot_of(key) is None
     assert Keys.session_of(Keys.life(alive, "f00d")) == "f00d"
     assert Keys.session_of(Keys.claim(alive, Keys.rank(1e9, "f00d"))) == "f00d"
     assert Keys.session_of(alive) is None

@@ -49,7 +49,7 @@ class Flown:
         if self.faults.occluded(self.t):
             return
         place = np.array([vehicle.place]) + self.sigma * self.random.standard_normal((1, 3))
-        place, toward, turned = self._capture.told(self.faults, self.t, place, np.array([vehicle.model.yaw]))
+        place, toward, turned = self._capture.measured(self.faults, self.t, place, np.array([vehicle.model.yaw]))
         self._under_way.append((self.t, tuple(place[0].tolist()), float(toward[0] + turned[0])))
         while self._under_way and self._under_way[0][0] <= self.t - self.delay_s + 1e-9:
             stamp, position, yaw = self._under_way.popleft()

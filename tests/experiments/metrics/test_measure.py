@@ -43,7 +43,7 @@ def test_numbers_of_robots_are_rows_of_figures():
 
 
 def test_a_new_figure_is_one_row(tmp_path, monkeypatch, capsys):
-    row = metric._ours(lambda m: m.trace.ticks * 2.0, "Twice", "Twice the ticks.", unit="s²", figure=True)
+    row = metric._row(lambda m: m.trace.ticks * 2.0, "Twice", "Twice the ticks.", unit="s²", figure=True)
     monkeypatch.setattr(metric, "OURS", {**OURS, "twice": row})
     before, after = pair(1.0 + np.exp(-T)), pair(2.0 + np.exp(-T))
     cases = [measure(replace(before, case="a")), measure(replace(after, case="b"))]

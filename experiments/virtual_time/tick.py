@@ -29,7 +29,7 @@ SENT: Final = 10  # numbers of a transmission
 AT_END, AT_PHASES, AT_HAZARDS = 0, 1, 2
 
 
-class Way:
+class LinkQueue:
     """Link, with the samples that are on it."""
 
     __slots__ = ("arrivals", "channel", "first", "neighbour", "next", "samples", "sent", "size", "wide")
@@ -102,7 +102,7 @@ class Member:
     seq: int  # number of its last transmission
     robot: Robot
     twin: Twin
-    ways: list[Way]
+    ways: list[LinkQueue]
     words: array[float]  # words of the last transmission
 
     def __init__(self, row: int, robot: Robot, twin: Twin, words: int) -> None:
@@ -112,7 +112,7 @@ class Member:
         self.words = array("d", (nan,)) * words
 
 
-class Planned:
+class PlannedTargets:
     """Itinerary with targets that are known beforehand, one for each decision."""
 
     __slots__ = ("decide_hz", "first", "targets")
@@ -273,7 +273,7 @@ def transmit(members: list[Member], t: float, ledger: Ledger) -> None:
     """First half of the decisions."""
     for member in members:
         robot = member.robot
-        if robot.question(t):
+        if robot.transmission_due(t):
             member.seq += 1
             speech = robot.transmitter.speech
             if speech is not None:
