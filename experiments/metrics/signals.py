@@ -93,7 +93,7 @@ class LinkErrors:
     def part(self, begin: int, end: int) -> LinkErrors:
         """The same from one row in time to another."""
         rows = slice(begin, end)
-        parts = {name: getattr(self, name)[rows] for name in ("time", "error", "alive", "there", "gone")}
+        parts = {name: getattr(self, name)[rows] for name in ("time", "error", "alive", "present", "gone")}
         return replace(self, **parts)
 
     def acquired(self, window: int, tolerance: float) -> list[float | None]:

@@ -79,11 +79,11 @@ def _least(found: Mapping[float, Array]) -> float:
 def report(path: Path, room: tuple[float, float, float]) -> Iterator[str]:
     """Lines about each kind of tag of a file; raises CamerasFileError."""
     lab = file.read(path)
-    cameras, told = models(lab), set[tuple[float, float, bool]]()
+    cameras, kinds = models(lab), set[tuple[float, float, bool]]()
     for name, body in lab.bodies.items():
-        if (key := (body.size, body.height, body.on_floor)) in told:
+        if (key := (body.size, body.height, body.on_floor)) in kinds:
             continue
-        told.add(key)
+        kinds.add(key)
         needed = "one camera" if body.on_floor else "two cameras"
         yield f"{name}, tag of {body.size:g} m: places of {room[0]:g} x {room[1]:g} m where {needed} or more see it"
         found = shares(cameras, body, body.size, room)
