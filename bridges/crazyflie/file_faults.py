@@ -20,9 +20,11 @@ from bridges.crazyflie.protocol.addresses import (
     dongle_of,
 )
 from bridges.crazyflie.protocol.crazyradio import software
+from bridges.crazyflie.protocol.parameters import parameter_faults
 
 BODY: Final = ("body",)
 SYSTEM: Final = ("device", "positioning")
+PARAMETERS: Final = ("device", "parameters")
 APART: Final = 2  # [channels of 1 MHz] distance from which on two radios leave each other alone
 
 
@@ -30,10 +32,13 @@ def file_faults(robots: Sequence[BodyEntry]) -> Iterator[BodyFault]:
     """As `Body.faults`."""
     addressed = []
     for each in robots:
-        wrong = list(judged(each, BODY, partial(address, each.name, each.address)))
-        yield from wrong
-        addressed += [each] if not wrong else []
+        misaddressed = list(judged(each, BODY, partial(address, each.name, each.address)))
+        yield from misaddressed
+        addressed += [each] if not misaddressed else []
         yield from _positioning(each)
+        table = settings(CrazyflieSettings, each.name, each.device)
+        for wrong in parameter_faults(table.parameters, table.unprotected):
+            yield BodyFault(each.name, PARAMETERS, wrong.message, wrong.remedy, wrong.severity)
     yield from _forwarded(robots)
     yield from _radios([each for each in addressed if dongle_of(each.address) and software(each.address) is None])
 

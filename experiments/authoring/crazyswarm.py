@@ -22,6 +22,7 @@ from agents.body.interface import BodyError
 from agents.errors import did_you_mean
 from agents.plugins import registry
 from bridges.crazyflie.protocol import addresses as protocol
+from bridges.crazyflie.protocol.parameters import parameter_faults
 from experiments.authoring.robotic_park.file import MISSING, YamlValue, load, text_of
 from experiments.catalogue import index
 from experiments.check.findings import join_names
@@ -86,7 +87,8 @@ class SwarmDrone:
     position: Position
     capture: _Capture
     made_up: bool = False  # True for a place that is not that of the file
-    device: Mapping[str, Any] = field(default_factory=dict)  # rates at which its radio carries all its drones
+    # firmware parameters, and rates at which its radio carries all its drones
+    device: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def radio(self) -> str:
@@ -113,7 +115,7 @@ def convert_text(text: str, label: str, duration_s: float) -> tuple[str, list[st
     root, notes = load(label, text), list[str]()
     drones = _with_rates(_on_one_channel(_apart(_enabled(root, notes), notes), notes), notes)
     source = _positioning(Path(label).parent, drones, notes)
-    notes += _notes(root, drones)
+    notes = [*dict.fromkeys([*notes, *_notes(root, drones)])]
     made = _text(Path(label).name, drones, source, duration_s, notes)
     document.loads(made)
     return made, notes
@@ -126,7 +128,7 @@ def _enabled(root: YamlValue, notes: list[str]) -> list[SwarmDrone]:
     for name, entry in listed:
         try:
             if entry.typed(_Enabled).enabled:
-                drones.append(_drone(root, name, entry))
+                drones.append(_drone(root, name, entry, notes))
             else:
                 left.append(name)
         except DocumentError as error:
@@ -163,7 +165,7 @@ def _listed(root: YamlValue) -> list[tuple[str, YamlValue]]:
     return rows
 
 
-def _drone(root: YamlValue, name: str, entry: YamlValue) -> SwarmDrone:
+def _drone(root: YamlValue, name: str, entry: YamlValue, notes: list[str]) -> SwarmDrone:
     if "robots" not in root.value:
         numbered = entry.typed(_NumberedEntry)
         uri, key = f"radio://0/{numbered.channel}/2M/E7E7E7E7{numbered.id:02X}", entry.key
@@ -181,7 +183,11 @@ def _drone(root: YamlValue, name: str, entry: YamlValue) -> SwarmDrone:
     except BodyError as error:
         message, _, hint = str(error).removeprefix(f"{name}: ").partition("; ")
         raise refusal(root.file, f"{key}: {message}", hint) from None
-    return SwarmDrone(name, key, uri, position, _capture(root, entry.key, kind))
+    capture, types = _capture(root, entry.key, kind), root.value.get("robot_types")
+    parameters = _parameters(
+        (root.value.get("all"), types.get(kind) if isinstance(types, dict) else None, entry.value), notes
+    )
+    return SwarmDrone(name, key, uri, position, capture, device={"parameters": parameters} if parameters else {})
 
 
 def _capture(root: YamlValue, key: str, kind: str) -> _Capture:
@@ -275,7 +281,7 @@ def _with_rates(drones: Sequence[SwarmDrone], notes: list[str]) -> list[SwarmDro
             if isinstance(fits.positioning, protocol.Outside):
                 device[radio]["positioning"] = {"system": "external", "rate_hz": fits.positioning.rate_hz}
             notes.append(f"radio {radio} has {len(here)} drones, and rates that it carries for them in `device`")
-    return [replace(each, device=device.get(each.radio, {})) for each in drones]
+    return [replace(each, device={**each.device, **device.get(each.radio, {})}) for each in drones]
 
 
 def _positioning(folder: Path, drones: Sequence[SwarmDrone], notes: list[str]) -> str | dict[str, str]:
@@ -311,23 +317,29 @@ def _notes(root: YamlValue, drones: Sequence[SwarmDrone]) -> Iterator[str]:
         yield f"{join_names(high, 12)}: the height of initial_position; drones start on the floor, and their yaw is 0"
     if single := [each.name for each in drones if each.capture.enabled and "single_marker" in each.capture.marker]:
         yield f"{join_names(single, 12)}: a single marker; here motion capture must know each drone as a rigid body"
-    parameters = list(dict.fromkeys(_paths(root.value, "firmware_params")))
-    if parameters:
-        yield (f"firmware_params: {join_names(parameters, 8)}; those on board stay; `device.parameters` sets others")
     others = dict.fromkeys(key for _, entry in _listed(root) for key in entry.value if key not in TAKEN)
     unread = [key for key in (*_keys(root.value.get("all")), *others) if key != "firmware_params"]
     if unread:
         yield f"{', '.join(dict.fromkeys(unread))}: logging, limits and tools of Crazyswarm; zenpark has its own"
 
 
-def _paths(value: object, key: str) -> Iterator[str]:
-    """Names `group.parameter` in every table of that key."""
-    if isinstance(value, Mapping):
-        for name, each in value.items():
-            if name == key and isinstance(each, Mapping):
-                yield from (f"{group}.{one}" for group, table in each.items() for one in _keys(table))
-            else:
-                yield from _paths(each, key)
+def _parameters(tables: Iterable[object], notes: list[str]) -> dict[str, float]:
+    """Firmware parameters of a drone that may be set, by tables of which later ones win; a note for each other one."""
+    found: dict[str, float] = {}
+    for table in tables:
+        groups = table.get("firmware_params") if isinstance(table, Mapping) else None
+        for group, values in groups.items() if isinstance(groups, Mapping) else ():
+            for name, value in values.items() if isinstance(values, Mapping) else ():
+                try:
+                    found[f"{group}.{name}"] = float(value)  # YAML has 1e-3 as a text
+                except (TypeError, ValueError):
+                    notes.append(f"firmware_params: {group}.{name}: {value!r} is no number")
+    reasons: dict[str, list[str]] = {}
+    for fault in [*parameter_faults(found)]:
+        del found[fault.name]
+        reasons.setdefault(f"{fault.message.removeprefix(fault.name)}; {fault.remedy}", []).append(fault.name)
+    notes += [f"firmware_params: {join_names(names, 8)}{reason}" for reason, names in reasons.items()]
+    return found
 
 
 def _keys(table: object) -> Iterable[str]:

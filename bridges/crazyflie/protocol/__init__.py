@@ -1,4 +1,4 @@
-"""Wire of the Crazyflie: addresses and settings, CRTP packets, frames of its radio. No sockets here.
+"""Wire of the Crazyflie: addresses and settings, CRTP packets, parameters, frames of its radio. No sockets here.
 
-May import: agents.body, agents.vectors.
+May import: agents.body, agents.errors, agents.vectors.
 """

@@ -77,6 +77,7 @@ class CrazyflieSettings(DeviceTable, frozen=True):
     # on board; None: Kalman if a positioning system is named, else as it is
     estimator: Literal["auto", "complementary", "kalman", "ukf"] | None = None
     parameters: dict[str, float] = {}  # firmware parameters to set on connecting
+    unprotected: list[str] = []  # those of them that may change a protection of the drone
     recover: bool = False  # recovers from a crash on connecting: only when the drone stands upright on the floor again
     arm: bool = True  # arm it before taking off, where the platform asks for that
     platform: Literal["crazyflie", "brushless"] = "crazyflie"  # used by the twin alone: a `brushless` one must be armed

@@ -24,10 +24,7 @@ from bridges.crazyflie.protocol.crtp import (
     SupervisorCommand,
     Toc,
 )
-from bridges.crazyflie.twin.logs import LogBlocks
-from bridges.crazyflie.twin.memory import ANCHORS
-from bridges.crazyflie.twin.planner import PlannerState
-from bridges.crazyflie.twin.tables import (
+from bridges.crazyflie.protocol.tables import (
     EXTENDED,
     PACKINGS,
     PARAMETER_CODES,
@@ -36,6 +33,9 @@ from bridges.crazyflie.twin.tables import (
     inventory,
     pack,
 )
+from bridges.crazyflie.twin.logs import LogBlocks
+from bridges.crazyflie.twin.memory import ANCHORS
+from bridges.crazyflie.twin.planner import PlannerState
 from bridges.crazyflie.twin.trajectories import Trajectories
 from bridges.crazyflie.twin.vehicle import Vehicle
 from twins.arrays import Array

@@ -13,7 +13,7 @@ import numpy as np
 from agents.vectors import ZERO, Vector
 from bridges.crazyflie.protocol import crtp
 from bridges.crazyflie.protocol.crtp import Info, Log, LogStatus
-from bridges.crazyflie.twin.tables import LOG_TYPES, PACKINGS, VariableTable, pack
+from bridges.crazyflie.protocol.tables import LOG_TYPES, PACKINGS, VariableTable, pack
 from bridges.crazyflie.twin.vehicle import Vehicle
 from twins.arrays import Array
 from twins.models.quadrotor import GRAVITY

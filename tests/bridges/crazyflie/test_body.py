@@ -97,10 +97,12 @@ def test_what_cannot_be_set_up(device, serve, said):
 @pytest.mark.system
 def test_settings_arrive():
     """Without positioning from outside the estimator is told where the robot stands, and is not left at (0, 0)."""
-    device = {"parameters": {"hlCommander.vtoff": 0.7, "stabilizer.controller": 2}, "multiranger": True}
+    parameters = {"hlCommander.vtoff": 0.7, "stabilizer.controller": 2, "supervisor.tmblChckEn": 0}
+    device = {"parameters": parameters, "unprotected": ["supervisor.tmblChckEn"], "multiranger": True}
     with connected_twins(device=device, start=[[0.5, 0.0, 0.0]]) as (twin, process):
         value = twin.device.drones[0].value
         assert (value("posCtlPid.thrustMin"), value("stabilizer.controller")) == (5000, 2)
+        assert value("supervisor.tmblChckEn") == 0
         assert value("hlCommander.vtoff") == pytest.approx(0.7)
         assert [value(f"kalman.initial{axis}") for axis in "XYZ"] == [0.5, 0.0, 0.0]
         process.until(lambda: np.abs(process.state.position - [0.5, 0.0, 0.0]).max() < 0.05, "there")

@@ -1,4 +1,4 @@
-"""Geometry of Lighthouse and Loco: what is refused before it is sent, and by `check`."""
+"""Geometry of Lighthouse and Loco, and firmware parameters: what is refused before it is sent, and by `check`."""
 
 import math
 
@@ -78,11 +78,34 @@ def test_anchors_that_tell_no_position(anchors, said):
         check_anchors(right)
 
 
-def faults(positioning, host=""):
-    device = {"positioning": positioning}
+def faults(positioning=None, host="", **device):
+    device |= {"positioning": positioning} if positioning else {}
     address = "radio://0/80/2M/E7E7E7E701"
     entry = BodyEntry("CF01", CRAZYFLIE, address, device, external=False, process="CF01", host=host)
     return [(each.severity, each.here, each.key[1:], each.message) for each in CrazyflieBody.faults([entry])]
+
+
+@for_each(
+    ("name", "value", "said"),
+    [
+        ("posCtlPid.xKp", 8.0, ""),
+        ("posCtlPid.xKp", 8.1, "error: posCtlPid.xKp = 8.1 is far from the firmware's own 2"),
+        ("posCtlPid.xKi", 0.1, ""),
+        ("posCtlPid.xKi", -0.1, "error: posCtlPid.xKi = -0.1 is no gain"),
+        ("posCtlPid.xKi", math.nan, "error: posCtlPid.xKi = nan is no gain"),
+        ("stabilizer.controller", 2.0, ""),
+        ("stabilizer.controller", 9.0, "error: stabilizer.controller = 9 is no choice"),
+        ("supervisor.tmblChckEn", 0.0, "error: supervisor.tmblChckEn is a protection of the drone"),
+        ("motorPowerSet.enable", 1.0, "error: motorPowerSet.enable: not for a file, as it turns motors"),
+        ("deck.bcLoco", 1.0, "error: deck.bcLoco: not for a file"),
+        ("posCtlPid.xKq", 1.0, "warning: posCtlPid.xKq is none of the 402 parameters"),
+    ],
+)
+def test_parameters_are_bounded(name, value, said):
+    found = [f"{severity}: {message}" for severity, _, _, message in faults(parameters={name: value})]
+    assert [each[: len(said)] for each in found] == [said] * bool(said)
+    allowed = faults(parameters={name: value}, unprotected=[name])
+    assert allowed == [] or not name.startswith("supervisor")
 
 
 def test_file_faults_find_geometry_where_it_lies(saved):

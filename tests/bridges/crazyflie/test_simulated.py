@@ -28,10 +28,10 @@ from bridges.crazyflie.pilot import LOGS_S, LOOP_HZ, SAFE_PARAMETERS
 from bridges.crazyflie.protocol import crtp
 from bridges.crazyflie.protocol.addresses import YOUNG_S, CrazyflieSettings, Outside, chosen, oldest_pose, overload
 from bridges.crazyflie.protocol.crtp import HighLevel, Log, Port, Setpoint
+from bridges.crazyflie.protocol.tables import LOG_CODES, PACKINGS
 from bridges.crazyflie.telemetry import Telemetry
 from bridges.crazyflie.twin.device import CrazyflieTwin
 from bridges.crazyflie.twin.supervisor import SupervisorState
-from bridges.crazyflie.twin.tables import LOG_CODES, PACKINGS
 from experiments.real_time.conductor.hot_changes import CLIMB_S
 from tests.bridges.crazyflie.flights import clocked
 from tests.cases import nightly

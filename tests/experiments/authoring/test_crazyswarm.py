@@ -27,7 +27,11 @@ TYPES = """robot_types:
     battery: {{voltage_warning: 3.8, voltage_critical: 3.7}}
 all:
   firmware_logging: {{enabled: false, default_topics: {{pose: {{frequency: 10}}}}}}
-  firmware_params: {{stabilizer: {{estimator: 2, controller: 1}}}}
+  firmware_params:
+    stabilizer: {{estimator: 2, controller: 2}}
+    kalman: {{pNAcc_xy: 0.7}}
+    posCtlPid: {{xKp: 90.0}}
+    pm: {{lowVoltage: 2.9}}
   broadcasts: {{num_repeats: 15, delay_between_repeats_ms: 1}}
 """
 OLD = "crazyflies:\n- {id: 1, channel: 100, initialPosition: [1.5, 1.5, 0.0], type: default}\n"
@@ -58,6 +62,9 @@ def test_enabled_drones_fly_by_their_radios():
     assert {each.position for each in robots.values()} == {"external"}
     assert read.experiment.positioning == "vicon-twin"
     assert all(word in notes for word in ("left out: cf2", "motion_capture.yaml", "stabilizer.estimator", "broadcasts"))
+    assert robots["cf1"].device == {"parameters": {"stabilizer.controller": 2, "kalman.pNAcc_xy": 1.0}}
+    assert "posCtlPid.xKp = 90 is far from the firmware's own 2; choose 0.5 to 8" in notes
+    assert "pm.lowVoltage is a protection of the drone" in notes
     found, _ = examine(read)
     assert {each.severity for each in found} == {"note"}  # none says that something is not compiled
     log = fly(read.experiment).log
@@ -92,7 +99,7 @@ def test_radio_has_one_channel_and_carries_its_drones():
     read, notes = converted(swarm(drone(1), drone(2, channel=100), *(drone(k) for k in range(3, 12)), captured="true"))
     robots = read.experiment.robots
     assert robots["cf2"].body == "radio://1/100/2M/E7E7E7E702"
-    assert (robots["cf2"].process, robots["cf2"].device) == ("radio1", {})
+    assert (robots["cf2"].process, {*robots["cf2"].device}) == ("radio1", {"parameters"})
     assert robots["cf1"].device["stream_hz"] < 10.0
     assert "channel 100, 2M, are on radio 1" in notes
     assert "radio 0 has 10 drones" in notes

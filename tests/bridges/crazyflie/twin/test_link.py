@@ -23,10 +23,10 @@ from bridges.crazyflie.protocol.crtp import (
     SupervisorCommand,
     Toc,
 )
+from bridges.crazyflie.protocol.tables import EXTENDED, LOG_CODES, PACKINGS, READ_ONLY, inventory, pack
 from bridges.crazyflie.twin.device import CrazyflieTwin
 from bridges.crazyflie.twin.memory import ANCHOR_PAGES, CALIBRATION, Memories
 from bridges.crazyflie.twin.radio import NOTHING, RadioLink
-from bridges.crazyflie.twin.tables import EXTENDED, LOG_CODES, PACKINGS, READ_ONLY, inventory, pack
 from bridges.crazyflie.twin.vehicle import Vehicle
 from tests.bridges.crazyflie.wire import Wire
 from tests.requests import request
