@@ -13,9 +13,12 @@ from types import SimpleNamespace
 
 import pytest
 
+from agents.body.device_address import plain_device
+from agents.body.device_locks import Claims
 from agents.body.interface import BodyError, refuse
 from agents.formation.link import Link
 from agents.plugins import registry
+from agents.ticks import Ticks
 from agents.vectors import ZERO
 from bridges.khepera4.kind import KHEPERA4
 from experiments.definition.plan import Plan
@@ -25,6 +28,7 @@ from tests.commands import ROOT, environment, python, shell
 from tests.requests import request
 from tests.small import triangle
 from tests.waiting import until
+from twins.device import DeviceRequest, Faults, serve_until_next
 from twins.engines.point_mass import model
 
 GUIDE = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
@@ -36,7 +40,8 @@ REGISTERED = re.findall(
 
 
 def source_of(name):
-    (source,) = [block for block in BLOCKS if f"class {name}" in block or f"\n{name} = " in block]
+    starts = (f"class {name}", f"\n{name} = ", f"def {name}(")
+    (source,) = [block for block in BLOCKS if any(start in block for start in starts)]
     return source
 
 
@@ -78,10 +83,11 @@ def shelled(installed):
 
 @pytest.mark.slow
 def test_trigger_of_the_docs_runs_from_outside(shelled):
-    assert {group for *_, group in REGISTERED} | {registry.LAWS} == {registry.BODIES, *registry.CHOSEN}
+    groups = {group for *_, group in REGISTERED} | {registry.LAWS}
+    assert groups == {registry.BODIES, registry.DEVICES, *registry.CHOSEN}
     assert len(source_of("SendEvery").splitlines()) <= 20
     listed = shelled("list").stdout
-    assert not [name for name, _, _, group in REGISTERED if group != "zenpark.bodies" and name not in listed]
+    assert not [name for name, _, _, group in REGISTERED if group != registry.BODIES and name not in listed]
     assert re.search(r"Laws: .*\bspring\b", listed)
     choice = 'cases.event.trigger={ kind = "send-every", metres = 0.02, maximum_silence_s = 5.0 }'
     run = shelled("run", "triangle", "--virtual", "--json", "--no-report", "--set", "duration_s=5", "--set", choice)
@@ -106,7 +112,7 @@ import sys, agents.robot, twins.body
 from agents.plugins import registry
 registry.load("zenpark.laws", "spring")
 for name, _, _, group in {REGISTERED}:
-    if group != registry.ENGINES:
+    if group not in (registry.ENGINES, registry.DEVICES):
         registry.load(group, name)
 assert registry.struct("zenpark.laws", "spring").__module__ == "my_laws"
 assert "numpy" not in sys.modules
@@ -208,6 +214,48 @@ def test_body_of_the_docs_refuses_wrong_addresses():
         silent.bind(("127.0.0.1", 0))
         with pytest.raises(BodyError, match="no pose within 3 s"):
             rovers("rover://{}:{}".format(*silent.getsockname())).open()
+
+
+def test_twin_of_the_docs_answers_its_body():
+    twin = made_in_guide("RoverTwin")(DeviceRequest(request(["khepera4"] * 2, "rover-twin"), Faults()))
+    over, ticks = threading.Event(), Ticks(100.0)
+
+    def serve():
+        while not over.is_set():
+            twin.advance(serve_until_next(twin, ticks))
+        twin.close()
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    body = rovers(*twin.addresses)
+    try:
+        body.open()
+        assert [state.position for state in body.read(1.0)] == [(0.0, 0.0, 0.0), (0.0, 1.0, 0.0)]
+        until(lambda: body.command([(0.1, 0.0, 0.0, 0.0)] * 2) or body.read(2.0)[1].position[0] > 0.02)
+        assert body.read(3.0)[1].position[1:] == (1.0, 0.0)
+    finally:
+        over.set()
+        thread.join()
+        body.close()
+
+
+def test_devices_of_the_docs_have_one_driver(runtime_folder):
+    numbered, calibrate = made_in_guide("NumberedRovers"), made_in_guide("calibrate")
+    named = [
+        numbered.device_of(SimpleNamespace(name="A", address=f"rover://{rest}"))
+        for rest in ("localhost/80/3", "127.0.0.1/80/3", "localhost/80/4")
+    ]
+    first, second, other = ({key for key, own in each.lock_keys() if own} for each in named)
+    assert first & second
+    assert not first & other
+    with pytest.raises(BodyError, match="write rover://base1/80/3"):
+        numbered.device_of(SimpleNamespace(name="A", address="rover://base1"))
+    claims = Claims([("KH01", plain_device("rover://127.0.0.1:5005"))])
+    claims.take()
+    with pytest.raises(BodyError, match="is in use: this process drives it for KH01"):
+        calibrate("rover://localhost:5005", "localhost", "5005", lambda: 1.0)
+    claims.release()
+    assert calibrate("rover://localhost:5005", "localhost", "5005", lambda: 1.0) == 1.0
 
 
 def test_law_of_the_docs_with_memory_steps():
