@@ -17,11 +17,11 @@ import zenoh
 from msgspec import Meta
 
 from agents.body.external_pose import External
-from agents.body.interface import UNANSWERED, Body, BodyError, BodyRequest, BodyState, settings
+from agents.body.interface import UNANSWERED, UNANSWERED_S, Body, BodyError, BodyRequest, BodyState, settings
 from agents.body.measured_positions import MeasuredPositions
 from agents.clock import uptime, wait_until
 from agents.errors import ExplainedError
-from agents.network import messages, pubsub
+from agents.network import messages, pubsub, validation
 from agents.network import session as network
 from agents.network.shutdown import leave
 from agents.runtime.range_inbox import RangeInbox
@@ -36,10 +36,8 @@ POLL_S: Final = 0.02  # pause between looks for them
 WORLD: Final = "world"  # the address of robots in the shared world process
 REPEAT_S: Final = 0.1  # period of repeated orders: the publisher drops samples when its queue is full
 HALT_S: Final = 3.0  # time for which `land` is repeated to a robot on wheels
-ANSWER_S: Final = 2.5  # time after a stop at which the note reports a robot that is not measured to stand still
 SUPERSEDED_S: Final = 1.0  # a shorter standstill costs no process its name
 STANDSTILL_S: Final = 1.0  # longest wait of `close` until stopped robots are measured to stand still
-VALID_BOX: Final = (1e3, 1e3, 1e3)  # [m] bounds of valid positions: any room
 
 
 @dataclass(slots=True)
@@ -139,7 +137,9 @@ class ExternalBody(Body):
         session, keys = self._session, self._keys
         mime = messages.MIME["json"]
         rows = range(len(self._names))
-        self._positions = MeasuredPositions(session, keys, self._names, rows, VALID_BOX, exact=rows, silence_s=FRESH_S)
+        self._positions = MeasuredPositions(
+            session, keys, self._names, rows, validation.ANY_ROOM, exact=rows, silence_s=FRESH_S
+        )
         self._ranges = RangeInbox(session, keys, self._names, rows)
         self._setpoints = [pubsub.publisher(session, keys.setpoint(name), mime) for name in self._names]
         self._orders = [
@@ -280,7 +280,7 @@ class ExternalBody(Body):
 
     def _note(self, row: int, now: float) -> str:
         robot, positions = self._robots[row], self._positions.sources[row].inbox
-        parts = [UNANSWERED] if now - robot.stopped_since > ANSWER_S and robot.goes_on(now) else []
+        parts = [UNANSWERED] if now - robot.stopped_since > UNANSWERED_S and robot.goes_on(now) else []
         if (age := now - robot.measured) > FRESH_S:
             what = "yaw" if robot.measured < robot.pose.time else "position"
             parts.append(f"no {what} for {age:.0f} s")

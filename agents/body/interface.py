@@ -228,6 +228,7 @@ class BodyError(ExplainedError, RuntimeError):
 
 FRESH_S: Final = 0.5  # an older setpoint is dropped: wheels stop, sticks are at rest
 
+UNANSWERED_S: Final = 2.5  # [s] longest time from a stop to the robot known to stand, before the note
 UNANSWERED: Final = "the emergency stop is not answered"  # note of a robot that was stopped and still moves
 
 

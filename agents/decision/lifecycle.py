@@ -31,6 +31,8 @@ class Phase(IntEnum):
 
 # the members of an enumeration are slow to look up, and every tick asks for them
 IDLE, READY, AIRBORNE, RUNNING, LANDING, DONE = (int(phase) for phase in Phase)
+PHASES: Final = {phase.word: int(phase) for phase in Phase}
+UNDER_WAY: Final = (Phase.AIRBORNE.word, Phase.RUNNING.word)
 
 AT_HEIGHT: Final = 0.05  # [m] distance below the hover height at which it has arrived
 ABOVE_HEIGHT: Final = 0.1  # [m] excess of height that counts as arrived: a Crazyflie overshoots

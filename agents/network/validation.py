@@ -30,6 +30,7 @@ MAX_NUMBERS: Final = 64  # most numbers that a robot says beside its pose
 ENORMOUS: Final = 1e12  # no variable of a law is that large, whatever its unit
 MAX_RAYS: Final = 720  # most rays of one sweep; the finest scanner here has 360
 MAX_RANGE: Final = 100.0  # [m]; no range sensor here sees farther
+ANY_ROOM: Final = (1e3, 1e3, 1e3)  # [m] bounds of valid positions where the arena is not known
 WORLD: Final = "world"  # source of all events of the world
 REACH_M: Final = 1.0  # a position farther outside the arena is refused
 MAX_YAW: Final = 1e3  # [rad]; ours is within ±π, other programs may count on over full turns

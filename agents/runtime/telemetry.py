@@ -18,7 +18,7 @@ import msgspec
 import zenoh
 
 from agents.body.interface import UNANSWERED, BodyState
-from agents.decision.lifecycle import Phase, Standing
+from agents.decision.lifecycle import UNDER_WAY, Phase, Standing
 from agents.decision.stepping import Stepping
 from agents.network import messages, pubsub
 from agents.network.keys import Keys
@@ -30,7 +30,6 @@ STATUS_S: Final = 1.0
 ROUNDING_S: Final = 1e-6
 INCIDENTS: Final = 16  # repeated in each status
 WORDS: Final = tuple(phase.word for phase in Phase)
-UNDER_WAY: Final = ("airborne", "running")
 
 
 @dataclass(eq=False)

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from enum import Enum
 from typing import Final
 
-from agents.body.interface import UNANSWERED
+from agents.body.interface import UNANSWERED, UNANSWERED_S
 from agents.clock import uptime
 from bridges.crazyflie.kind import CRAZYFLIE
 from bridges.crazyflie.link import CrazyflieLink
@@ -42,7 +42,6 @@ REPLY_S: Final = 0.15  # deadline of the reply to a high-level command; then the
 TRIES: Final = 12
 ARMING_S: Final = 4.0  # motors that are checked one by one take seconds
 STOPPING_S: Final = 2.0  # time after a stop for which a Crazyflie that does not report "locked" still reports "flying"
-ANSWER_S: Final = 2.5  # the note reports an emergency stop that is unconfirmed for longer
 POLL_S: Final = 0.02
 FRESH_S: Final = 1.0  # an older status is ignored
 LOOP_SILENCE_S: Final = 1.0  # [s] longest pause of the robot's loop between commands in flight
@@ -338,7 +337,7 @@ class FlightControl:
     def send_due(self, now: float) -> None:
         """Send the packets that are due at `now` on the clock `uptime` [s]."""
         if self.phase is FlightPhase.STOPPING:
-            if now - self.phase_since > ANSWER_S:
+            if now - self.phase_since > UNANSWERED_S:
                 self.trouble = UNANSWERED
             self.link.cf.supervisor.send_emergency_stop()
         if now > self._disarm_at:

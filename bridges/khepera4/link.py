@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Final
 from urllib.parse import parse_qsl, urlsplit
 
-from agents.body.interface import FRESH_S, BodyError
+from agents.body.interface import FRESH_S, UNANSWERED_S, BodyError
 from agents.clock import uptime
 from agents.ticks import Ticks
 from bridges.khepera4 import protocol
@@ -37,7 +37,6 @@ TCP_THIN_LINEAR_TIMEOUTS: Final = 16  # option of Linux: the first repetitions o
 FORM: Final = (
     "write khepera4://HOST for Robotic Park's server, kteam://HOST:PORT or kteam:///dev/ttyS0 for K-Team's kh4server"
 )
-ANSWER_S: Final = 2.5  # time after a halt at which the note reports a robot that is not known to stand still
 
 
 @dataclass(frozen=True)
@@ -169,7 +168,7 @@ class Khepera4Link:
 
     def unanswered(self, now: float) -> bool:
         """Whether a halt is not confirmed by odometry in time."""
-        return now - self.halted_since > ANSWER_S and not (
+        return now - self.halted_since > UNANSWERED_S and not (
             self._stands and math.hypot(*self.odometry.velocity) < STANDING
         )
 

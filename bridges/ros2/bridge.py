@@ -35,7 +35,6 @@ from bridges.ros2.node import Participant, Publisher, Subscriber
 NODE: Final = "zenpark"
 FRAME: Final = "map"  # the arena, as rviz and nav2 name the fixed frame; goals must be in it
 POLL_S: Final = 0.01
-VALID_BOX: Final = (1e3, 1e3, 1e3)  # [m] bounds of valid positions: any room
 DEGREE: Final = radians(1.0)
 SAME: Final = 1e-3  # [rad] bearings that differ less are one
 OK, WARN, ERROR = 0, 1, 2  # levels of a DiagnosticStatus
@@ -159,7 +158,9 @@ class Graph:
     def _publish_states(self) -> None:
         """Publish received states as pose, transform and velocity."""
         now, transforms = self._clock.utc(), []
-        for state in self._feed.states.read(lambda state: validation.check_state(state, now=now, valid_box=VALID_BOX)):
+        for state in self._feed.states.read(
+            lambda state: validation.check_state(state, now=now, valid_box=validation.ANY_ROOM)
+        ):
             if (robot := self._robots.get(state.robot)) is None:
                 continue
             robot.stamp = state.stamp

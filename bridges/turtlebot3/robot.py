@@ -11,7 +11,7 @@ from typing import Final
 
 import zenoh
 
-from agents.body.interface import FRESH_S, UNANSWERED, BodyRequest, RangeScan, settings
+from agents.body.interface import FRESH_S, UNANSWERED, UNANSWERED_S, BodyRequest, RangeScan, settings
 from agents.network import pubsub
 from agents.network import session as network
 from bridges.ros2 import messages as ros2
@@ -23,7 +23,6 @@ from bridges.turtlebot3.odometry import STANDING, Odometry, StampAge
 REPEAT_S: Final = 0.05  # longest time between commands while the robot shall move,
 BETWEEN_S: Final = 0.02  # shortest time between commands that change
 ZEROS: Final = 20  # number of zeros after a stop; more while odometry reports motion
-ANSWER_S: Final = 2.5  # time after a halt at which the note reports a robot that is not known to stand still
 BLOCKED_S: Final = 1.5  # time at which the note reports a robot that does not move despite commands
 
 Velocity = tuple[float, float]  # v [m/s], ω [rad/s]
@@ -183,7 +182,7 @@ class TurtleBotConnection:
 
     def note(self, now: float, linked: bool) -> str:
         """Faults for users; empty if none."""
-        late = now - self.commanded.halted_since > ANSWER_S and not self.odometry.standing
+        late = now - self.commanded.halted_since > UNANSWERED_S and not self.odometry.standing
         return "; ".join(part for part in (UNANSWERED if late else "", self._link_fault(now, linked)) if part)
 
     def _link_fault(self, now: float, linked: bool) -> str:

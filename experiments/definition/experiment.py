@@ -18,6 +18,7 @@ from agents.network.channel_model import AtLeastOne, Delay, LinkEffects
 from agents.vectors import NotNegative, Positive, Share
 from twins.scene import Obstacle, Planar
 
+WALL: Final = "wall"  # name of the border of the arena in contacts
 WORLD: Final = "world"  # the body of a robot that lives in the twin service
 VICON_TWIN: Final = "vicon-twin"  # simulated motion capture, where the file names none
 TWIN: Final = "-twin"  # ends the name of motion capture that is simulated as well

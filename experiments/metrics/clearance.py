@@ -15,9 +15,9 @@ import numpy as np
 
 from agents.body.kinds import KINDS, Kind
 from agents.plugins import registry
-from experiments.definition.experiment import WORLD
+from experiments.definition.experiment import WALL, WORLD
 from experiments.metrics.results import Approach, Collision
-from experiments.recording.trace import WALL, Trace
+from experiments.recording.trace import Trace
 from twins import scene as outlines
 from twins.arrays import Array, Index, Mask, norm
 from twins.scene import Scene

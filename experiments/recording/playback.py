@@ -15,7 +15,7 @@ import numpy as np
 from msgspec.structs import astuple, replace
 
 from agents.body.kinds import KINDS, RecordedKind
-from agents.decision.lifecycle import Phase
+from agents.decision.lifecycle import PHASES, Phase
 from agents.network.messages import (
     CentreState,
     Contact,
@@ -51,6 +51,7 @@ from experiments.recording.resample import HOLE_S, attitude, line, step, turn
 from experiments.recording.ros2 import payload
 from experiments.recording.topics import JSON, KINDS_JSON, METADATA, TOPICS, SentGoal, SentPose, Topic
 from experiments.recording.trace import (
+    OPTIONAL,
     ROUNDING_S,
     Goals,
     Trace,
@@ -62,13 +63,11 @@ from twins.arrays import Array, Index
 HOLD_PERIODS: Final = 2.0  # state periods for which a sample is valid
 EARLY_S: Final = 0.5  # a landing at most this much before the planned end is a regular one [s]
 AROUND_S: Final = 600.0  # [s] longest time before and after a run that a replay shows
-PHASES: Final = {phase.word: int(phase) for phase in Phase}
 LANDED: Final = (Phase.LANDING.word, Phase.DONE.word)
 NOWHERE: Final = (math.nan, math.nan, math.nan)
 # topics and encodings by their types in the file
 TYPES: Final = {payload.type_name(topic.message, each): (topic, each) for topic in TOPICS for each in payload.NAMES}
 RECORDED: Final[dict[type[msgspec.Struct], type[SentPose | SentGoal]]] = {Pose: SentPose, Goal: SentGoal}
-OPTIONAL: Final = ("attitude", "shadow_position", "shadow_yaw")  # columns that a trace may lack
 
 S = TypeVar("S", bound=msgspec.Struct)
 M = TypeVar("M", State, SentPose, Status, LawMemory)

@@ -20,8 +20,8 @@ from experiments.recording.clocks import ClockOffset
 from twins.arrays import Array, Index, Mask
 
 EPOCH: Final = 1_700_000_000.0  # UTC [s] of the common start in virtual time: any, but the same in every run
+OPTIONAL: Final = ("attitude", "shadow_position", "shadow_yaw")  # columns that are left out where nothing is known
 ROUNDING_S: Final = 1e-6  # UTC seconds in a float are exact to a quarter of a microsecond
-WALL: Final = "wall"  # name of the arena's wall in contacts
 
 M = TypeVar("M", Contact, WorldState)
 

@@ -19,13 +19,14 @@ from agents.decision.stepping import Words
 from agents.network import messages
 from agents.safety.hazards import Outcome
 from experiments.arrays import PoseTable
+from experiments.definition.experiment import WALL
 from experiments.definition.graph import Links
 from experiments.definition.plan import Plan
 from experiments.recording.topics import Message
 from experiments.recording.trace import (
     EPOCH,
+    OPTIONAL,
     ROUNDING_S,
-    WALL,
     Goals,
     Trace,
     poses_in_run,
@@ -34,7 +35,7 @@ from experiments.recording.trace import (
 from experiments.recording.writer import Recording
 from experiments.scene import markers
 from experiments.virtual_time.network import CentreLog
-from experiments.virtual_time.simulation import OPTIONAL, VirtualRunLog
+from experiments.virtual_time.simulation import VirtualRunLog
 from twins.arrays import Array, Index
 
 SAMPLED: Final = ("position", "yaw", "true_position", "goal", "setpoint")  # columns of a log that a trace has as well

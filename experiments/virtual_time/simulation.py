@@ -24,6 +24,7 @@ from agents.safety.hazards import HazardChange
 from experiments.arrays import PoseTable
 from experiments.definition.bodies import body_request, shadow_periods, shared_world
 from experiments.definition.plan import Plan
+from experiments.recording.trace import OPTIONAL
 from experiments.virtual_time.conductor import PATIENCE_S, Stuck, VirtualConductor
 from experiments.virtual_time.network import CentreLog, VirtualNetwork
 from experiments.virtual_time.steps import Steps
@@ -34,7 +35,6 @@ from twins.body import TwinBody
 from twins.engines.engine import Engine, Touch
 
 STATE: Final = ("position", "velocity", "yaw", "true_position", "true_yaw")  # columns from the state of the bodies
-OPTIONAL: Final = ("attitude", "shadow_position", "shadow_yaw")  # columns that are left out where nothing is known
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,6 @@ from twins.arrays import Array
 from twins.device import Capture, CaptureFault, Faults, FaultyLink, Server, serve_until_next
 
 BACKLOG: Final = 1 << 18  # [bytes] largest queue of a client; a slower client misses frames
-VALID_BOX: Final = (1e3, 1e3, 1e3)  # [m] bounds of valid positions: any room
 FRESH_S: Final = 0.5  # a robot with an older true pose is not visible
 
 
@@ -311,7 +310,7 @@ class TruthSubscription:
 
     def update(self, capture: CaptureTwin, now: float) -> None:
         """Place every robot with a fresh pose at UTC time `now` [s], and hide the others."""
-        check = partial(validation.check_position, now=now, valid_box=VALID_BOX)
+        check = partial(validation.check_position, now=now, valid_box=validation.ANY_ROOM)
         for row, inbox in enumerate(self._inboxes):
             for truth in inbox.read(check):
                 self._stamp[row] = truth.stamp

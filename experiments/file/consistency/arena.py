@@ -8,12 +8,11 @@ from typing import Final
 import numpy as np
 
 from agents.body.kinds import KINDS
-from experiments.definition.experiment import Arena, RobotTable, StartBox
+from experiments.definition.experiment import WALL, Arena, RobotTable, StartBox
 from experiments.file.problems import Fault
 from twins import scene as outlines
 from twins.scene import Scene
 
-WALL: Final = "wall"  # name of the border of the arena in contacts
 _ROUNDING: Final = 1e-9  # [m]
 
 

@@ -11,8 +11,7 @@ from agents.body.kinds import KINDS, Kind
 from agents.errors import did_you_mean
 from agents.plugins import files, registry
 from experiments.definition.bodies import body_faults, device_struct, driven_kind
-from experiments.definition.experiment import MEAN, TWIN, WORLD, WORST, Experiment, RobotTable
-from experiments.file.consistency.arena import WALL
+from experiments.definition.experiment import MEAN, TWIN, WALL, WORLD, WORST, Experiment, RobotTable
 from experiments.file.problems import Fault
 from experiments.file.structure import table_faults
 from twins.engines.engine import EngineFactory, require_carried

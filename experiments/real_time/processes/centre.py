@@ -17,7 +17,7 @@ from typing import Final
 
 from agents.clock import Clock, uptime
 from agents.decision.centralised import Centre, CentreGoal
-from agents.decision.lifecycle import IDLE, Phase
+from agents.decision.lifecycle import IDLE, PHASES
 from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
@@ -35,7 +35,6 @@ from experiments.real_time.processes.joining import Launch, Network, joined
 REPORT_S: Final = 1.0
 DEPTH: Final = 64  # queued poses of a robot
 ROUNDING_S: Final = 1e-5  # stamps are rounded
-PHASES: Final = {phase.word: int(phase) for phase in Phase}
 
 
 class CentreProcess:

@@ -16,6 +16,7 @@ from typing import Final
 import msgspec
 
 from agents.clock import Clock
+from agents.decision.lifecycle import UNDER_WAY
 from agents.network import messages, pubsub, validation
 from agents.network import session as network
 from agents.network.keys import Keys
@@ -36,7 +37,6 @@ ANSWER_S: Final = 1.0  # limit for robots to send their state
 STRANGERS: Final = 100  # distinct unknown robots that are reported
 IN_AIR_M: Final = 0.05
 UP: Final = ("ready", "airborne", "running", "landing")  # phases in which a robot may be in the air
-UNDER_WAY: Final = ("airborne", "running")
 
 
 class Events:

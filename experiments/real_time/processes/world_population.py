@@ -14,12 +14,11 @@ from agents.errors import Refusal, did_you_mean
 from agents.network import messages
 from agents.vectors import NO_SETPOINT, Setpoint
 from experiments.definition import bodies
-from experiments.definition.experiment import WORLD
+from experiments.definition.experiment import WALL, WORLD
 from experiments.definition.plan import Plan
 from twins import scene
 from twins.body import TwinBody
 
-WALL: Final = "wall"  # name of the walls of the arena in contacts
 HOLD_S: Final = 0.5  # time without a command after which a flying robot holds its position
 
 
