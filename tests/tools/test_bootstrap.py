@@ -218,15 +218,22 @@ def test_python_in_a_path_with_blanks_is_found(bootstrap, monkeypatch):
 
 @pytest.fixture
 def started_modules(bootstrap, monkeypatch):
-    """The modules that `./zenpark test` starts; those of tests fail."""
+    """The modules that `./zenpark test` starts; those of tests fail, and mypy if its `code` says so."""
     modules = []
+
+    def begin(module):
+        modules.append(module)
+        return Mock(args=["python", "-m", *module], returncode=begin.code, communicate=lambda: ("", None))
+
+    begin.code = 0
+    monkeypatch.setattr(bootstrap, "begin", begin)
     monkeypatch.setattr(bootstrap, "add_needed", lambda: None)
     monkeypatch.setattr(bootstrap, "python", lambda module: modules.append(module) or -9 * (module[0] == "pytest"))
     return modules
 
 
-def test_tests_run_in_three_parts_or_as_given(bootstrap, started_modules):
-    """A part that a signal ends has failed."""
+def test_tests_run_in_two_parts_or_as_given(bootstrap, started_modules):
+    """A part that a signal ends has failed; no other part begins after types that are wrong."""
 
     def started(*words, code=9):
         started_modules.clear()
@@ -234,13 +241,14 @@ def test_tests_run_in_three_parts_or_as_given(bootstrap, started_modules):
         assert [module[0] for module in started_modules[:3]] == ["ruff", "ruff", "mypy"]
         return started_modules[3:]
 
-    computing, devices, runs = started()
+    processes, computing = started()
     assert computing[:3] == ["pytest", "-m", "not system and not nightly"]
-    for part, workers, whole_runs in ((devices, "2", False), (runs, "1", True)):
-        assert part[2:5] == ["mechanism", "-n", workers]
-        assert {file.startswith("tests/system/") for file in part if file.startswith("tests/")} == {whole_runs}
+    assert processes[2:5] == ["mechanism", "-n", "4"]
+    assert {"tests/system/test_run.py", "tests/agents/network/test_session.py"} < {*processes}
     assert started("--quick", "tests/agents", "-x", code=-9) == [
         ["pytest", "-m", bootstrap.QUICK, "tests/agents", "-x"]
     ]
     modules = [module[0] for module in started("--all")]
     assert modules == ["pytest", "tests.fuzz", "tests.system.zenohd", "tests.system.rclpy_wheels", "pytest"]
+    bootstrap.begin.code = 1
+    assert [len(started(*words, code=1)) for words in ((), ["--quick"], ["tests/agents"])] == [1, 0, 0]
