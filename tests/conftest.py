@@ -43,7 +43,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Refuses two tests for one mechanism: each costs seconds in which nothing else runs."""
+    """Refuses two tests for one mechanism: each costs seconds."""
     shown: dict[str, str] = {}
     for item in items:
         if (marker := item.get_closest_marker("mechanism")) is not None:

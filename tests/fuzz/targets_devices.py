@@ -94,7 +94,9 @@ def khepera_bridge():
             if which[:1] == b"k":
                 driver, speeds = KTeam(line, khepera4.Khepera4Settings()), [0.1]
             else:
-                driver, speeds = identify(line, khepera4.Khepera4Settings(), named.get(which[:1])), [0.1, -0.1]
+                server = named.get(which[:1])
+                driver = identify(line, khepera4.Khepera4Settings(), server, over=lambda: not parts)
+                speeds = [0.1, -0.1]
             driver.begin()
             for speed in speeds:
                 driver.drive(speed, 0.2)

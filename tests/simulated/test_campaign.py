@@ -10,7 +10,7 @@ from tests.simulated import campaign, laboratory
 from tests.simulated.faults import Fault
 from tests.simulated.laboratory import ROOT
 
-FIRST, PARTS, EACH = 1, 10, 10  # seeds of every test run, in parts that workers share: one to two minutes of a core
+FIRST, PARTS, EACH = 1, 25, 4  # seeds of every test run, in parts that workers share: a minute of a core
 NIGHTLY, NIGHTLY_PARTS, NIGHTLY_EACH = 100_000, 50, 96  # seeds that make 5,000 with the others
 
 TRACES = """
@@ -51,7 +51,7 @@ def test_thousands_of_scripts_break_no_rule(part):
 def test_seeds_repeat_to_the_last_switch():
     seeds = ["3", "7"]  # a capture and a world
     printed = set()
-    for hashes in ("0", "1", "random"):
+    for hashes in ("0", "1"):
         environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONHASHSEED": hashes}
         command = [sys.executable, "-c", TRACES, *seeds]
         done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True)

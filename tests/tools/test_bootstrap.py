@@ -243,7 +243,7 @@ def test_tests_run_in_two_parts_or_as_given(bootstrap, started_modules):
 
     processes, computing = started()
     assert computing[:3] == ["pytest", "-m", "not system and not nightly"]
-    assert processes[2:5] == ["mechanism", "-n", "4"]
+    assert processes[2:5] == ["mechanism", "-n", "2"]
     assert {"tests/system/test_run.py", "tests/agents/network/test_session.py"} < {*processes}
     assert started("--quick", "tests/agents", "-x", code=-9) == [
         ["pytest", "-m", bootstrap.QUICK, "tests/agents", "-x"]
