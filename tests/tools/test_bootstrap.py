@@ -218,28 +218,32 @@ def test_python_in_a_path_with_blanks_is_found(bootstrap, monkeypatch):
 
 @pytest.fixture
 def started_modules(bootstrap, monkeypatch):
-    """The modules that `./zenpark test` starts; those of tests fail, and mypy if its `code` says so."""
-    modules = []
+    """The modules that `./zenpark test` starts; tests fail in the foreground, and mypy if `wrong` is not empty."""
+    modules, wrong = [], []
 
     def begin(module):
         modules.append(module)
-        return Mock(args=["python", "-m", *module], returncode=begin.code, communicate=lambda: ("", None))
+        return Mock(returncode=0, communicate=lambda: ("", None))
 
-    begin.code = 0
-    monkeypatch.setattr(bootstrap, "begin", begin)
+    def python(module, **_):
+        modules.append(module)
+        return -9 if module[0] == "pytest" else int(module[0] == "mypy" and bool(wrong))
+
     monkeypatch.setattr(bootstrap, "add_needed", lambda: None)
-    monkeypatch.setattr(bootstrap, "python", lambda module: modules.append(module) or -9 * (module[0] == "pytest"))
-    return modules
+    monkeypatch.setattr(bootstrap, "begin", begin)
+    monkeypatch.setattr(bootstrap, "python", python)
+    return modules, wrong
 
 
 def test_tests_run_in_two_parts_or_as_given(bootstrap, started_modules):
-    """A part that a signal ends has failed; no other part begins after types that are wrong."""
+    """A part that a signal ends has failed; nothing is computed while types are wrong."""
+    modules, wrong = started_modules
 
     def started(*words, code=9):
-        started_modules.clear()
+        modules.clear()
         assert bootstrap.test([*words]) == code
-        assert [module[0] for module in started_modules[:3]] == ["ruff", "ruff", "mypy"]
-        return started_modules[3:]
+        assert [module[0] for module in modules if module[0] != "pytest"][:3] == ["ruff", "ruff", "mypy"]
+        return [module for module in modules if module[0] not in {"ruff", "mypy"}]
 
     processes, computing = started()
     assert computing[:3] == ["pytest", "-m", "not system and not nightly"]
@@ -248,7 +252,7 @@ def test_tests_run_in_two_parts_or_as_given(bootstrap, started_modules):
     assert started("--quick", "tests/agents", "-x", code=-9) == [
         ["pytest", "-m", bootstrap.QUICK, "tests/agents", "-x"]
     ]
-    modules = [module[0] for module in started("--all")]
-    assert modules == ["pytest", "tests.fuzz", "tests.system.zenohd", "tests.system.rclpy_wheels", "pytest"]
-    bootstrap.begin.code = 1
-    assert [len(started(*words, code=1)) for words in ((), ["--quick"], ["tests/agents"])] == [1, 0, 0]
+    names = [module[0] for module in started("--all")]
+    assert names == ["pytest", "tests.fuzz", "tests.system.zenohd", "tests.system.rclpy_wheels", "pytest"]
+    wrong.append("a type")
+    assert [started(*words, code=1)[1:] for words in ((), ["--quick"], ["tests/agents"])] == [[], [], []]
