@@ -54,7 +54,7 @@ SUBJECTS: Final = (
     surroundings.walls, surroundings.ceiling,
     motion.encounters, motion.speeds, motion.recordings, motion.turning_circle, motion.rates, motion.ends,
     safety.architecture, safety.safety, safety.batteries, safety.libraries, safety.devices,
-    safety.turned,
+    safety.turned, safety.positioning,
     chance, compilation,
 )  # fmt: skip
 

@@ -130,6 +130,19 @@ def turned(analysis: Analysis) -> Iterator[Finding]:
         yield Finding("note", "turned", message, "", ("robots", next(iter(flying)), "start"))
 
 
+def positioning(analysis: Analysis) -> Iterator[Finding]:
+    """Warn of a source of positions that no robot uses; say which robots need a program of the lab's own."""
+    experiment, measured = analysis.plan.experiment, analysis.plan.externally_measured
+    if experiment.capture is not None and not measured:
+        message = f'no robot has position = "external", so nothing is asked of {experiment.capture.source}'
+        yield Finding("warning", "position-unused", message, "add it to each robot that is measured", ("positioning",))
+    elif experiment.capture is None and measured:
+        source = f"park/{measured[0]}/position".replace("park", experiment.network.realm, 1)
+        message = f"{join_names(measured)}: positions from outside, by a program that publishes {source}"
+        remedy = 'or name a system: positioning = "optitrack://HOST"'
+        yield Finding("note", "position-published", message, remedy, ("robots", measured[0], "position"))
+
+
 def architecture(analysis: Analysis) -> Iterator[Finding]:
     """Describe the architecture; check the age of goals, and that the trigger suits guided robots."""
     experiment, path = analysis.plan.experiment, ("architecture",)

@@ -429,3 +429,13 @@ def test_yaw_of_a_drone_is_said():
     found = findings(document.read(TRIANGLE, ["robots.CF01.start=[0.0, 0.5, 1.0]"]), ["event"])["turned"]
     assert (found.severity, "CF01 by 57°" in found.message) == ("note", True)
     assert "turned" not in findings(document.read(TRIANGLE, ["robots.KH01.start=[-0.6, -0.45, 1.0]"]), ["event"])
+
+
+@pytest.mark.usefixtures("unflown")
+def test_source_of_positions_is_used():
+    source, external = 'positioning="optitrack://192.168.10.1"', 'robots.CF01.position="external"'
+    unused = findings(document.read(TRIANGLE, [source]), ["event"])["position-unused"]
+    assert unused.severity == "warning"
+    published = findings(document.read(TRIANGLE, [external]), ["event"])["position-published"]
+    assert published.message == "CF01: positions from outside, by a program that publishes park/CF01/position"
+    assert not {*findings(document.read(TRIANGLE, [source, external]), ["event"])} & {unused.code, published.code}
