@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from math import nan
 from typing import Any, Final, Literal
 
-import msgspec
 import numpy as np
 
 from agents.decision.assignment import Assignment
 from agents.errors import ExplainedError, did_you_mean
-from agents.plugins.extras.policy import steered
 from agents.plugins.law import Control, Law, Memory, View
 from agents.plugins.triggers import Trigger, TriggerView
 
@@ -28,13 +28,15 @@ class LearningError(ExplainedError, ValueError):
 class Actions(Law, frozen=True):
     """Law of an agent: its last action."""
 
-    action: Action = "velocity"
-    # by the names of robots; written between two decisions
-    actions: dict[str, tuple[float, float]] = msgspec.field(default_factory=dict)
+    action: Action
+    numbers: array[float]  # x, y of each robot; written between two decisions
 
     def step(self, view: View, memory: Memory) -> Control:
-        x, y = self.actions.get(view.robot.name, (0.0, 0.0))
-        return steered(view, x, y, self.action)
+        k = 2 * view.robot.number
+        x, y = self.numbers[k], self.numbers[k + 1]
+        if self.action == "velocity":
+            return Control(velocity=(x, y, nan))
+        return Control(goal=(view.position[0] + x, view.position[1] + y, nan))
 
 
 class ActionsAlone(Actions, frozen=True):
@@ -46,22 +48,26 @@ class ActionsAlone(Actions, frozen=True):
 class Voice(Trigger, frozen=True):
     """Transmits where the agent says so, once."""
 
-    name: str = ""
-    asked: set[str] = msgspec.field(default_factory=set)  # names of robots; written between two decisions
+    asked: array[float]  # 1 for each robot that says so; written between two decisions
+    number: int
 
     def fires(self, view: TriggerView) -> bool:
-        due = self.name in self.asked
-        self.asked.discard(self.name)
+        due = self.asked[self.number] > 0.0
+        self.asked[self.number] = 0.0
         return due
 
 
 class AgentActions:
     """Last actions of all agents."""
 
-    def __init__(self, action: Action, law: Law, *, talk: bool) -> None:
-        """Replace a `law`; `talk`: agents decide when to transmit, within the intervals of the file's trigger."""
-        self._actions, self._asked = dict[str, tuple[float, float]](), set[str]()
-        self._law = (ActionsAlone if law.ALONE else Actions)(action, self._actions)
+    def __init__(self, action: Action, law: Law, rows: Mapping[str, int], *, talk: bool) -> None:
+        """Replace a `law` of robots with their numbers in `rows`.
+
+        `talk`: agents decide when to transmit, within the intervals of the file's trigger.
+        """
+        self._rows = rows
+        self._actions, self._asked = array("d", [0.0] * (2 * len(rows))), array("d", [0.0] * len(rows))
+        self._law = (ActionsAlone if law.ALONE else Actions)(action=action, numbers=self._actions)
         self.numbers = TALKING if talk else SILENT
 
     def assignment(self, given: Assignment) -> Assignment:
@@ -69,13 +75,13 @@ class AgentActions:
         trigger = given.trigger
         if self.numbers == TALKING:
             limits = {name: getattr(trigger, name) for name in Trigger.__struct_fields__} | {"evaluate_every_s": 0.0}
-            trigger = Voice(name=given.name, asked=self._asked, **limits)
+            trigger = Voice(asked=self._asked, number=self._rows[given.name], **limits)
         return replace(given, law=self._law, trigger=trigger)
 
     def clear(self) -> None:
         """Forget all actions."""
-        self._actions.clear()
-        self._asked.clear()
+        for each in (self._actions, self._asked):
+            each[:] = array("d", [0.0] * len(each))  # the same array: records refer to it
 
     def take(self, actions: Mapping[str, Any], agents: Sequence[str]) -> None:
         """Take the actions of all `agents`; raises LearningError where one is missing, or not finite."""
@@ -93,6 +99,7 @@ class AgentActions:
             if not np.isfinite(numbers).all():
                 remedy = "look for NaN in its observation and in the weights of the policy"
                 raise LearningError(f"actions: that of {name} is {numbers.tolist()}, not finite; {remedy}")
-            self._actions[name] = x, y
+            row = self._rows[name]
+            self._actions[2 * row], self._actions[2 * row + 1] = x, y
             if said and said[0] > 0.0:
-                self._asked.add(name)
+                self._asked[row] = 1.0

@@ -29,6 +29,7 @@ from experiments.file.document import Document, chosen_case
 from experiments.learning.actions import Action, AgentActions, LearningError
 from experiments.metrics.clearance import present_overlaps
 from experiments.virtual_time.simulation import Snapshot, VirtualRun
+from experiments.virtual_time.stretch import stretches_of
 from twins.arrays import Array
 
 try:
@@ -122,7 +123,8 @@ class Environment(ParallelEnv):  # type: ignore[misc] # it has no types
         self.possible_agents, self.agents = [each for each in moved if each in (agents or moved)], list[str]()
         self._reward: Reward = reward or self._link_error
         self._price, self._penalty = message_price, penalty
-        self._acts = AgentActions(action, plan.law, talk=talk)
+        self._rows = {name: row for row, name in enumerate(plan.names)}
+        self._acts = AgentActions(action, plan.law, self._rows, talk=talk)
         given = {name: plan.assignment(name) for name in plan.names}
         self._assignments = given | {name: self._acts.assignment(given[name]) for name in self.possible_agents}
         self._every, kinds = given[plan.names[0]].decide_every, plan.kinds
@@ -130,7 +132,6 @@ class Environment(ParallelEnv):  # type: ignore[misc] # it has no types
         self._reach = [
             (i, j, kinds[i].radius + kinds[j].radius) for i, j in pairs
         ]  # rows, and distance at which they touch [m]
-        self._rows = {name: row for row, name in enumerate(plan.names)}
         self._starts, self._kept = starts, dict[int, bytes]()
         self._first = self._next = self.seed = plan.experiment.seed
         if callable(observes):
@@ -203,6 +204,7 @@ class Environment(ParallelEnv):  # type: ignore[misc] # it has no types
 
     def _restore(self, state: bytes) -> None:
         self.seed, self.agents, self._run = StateUnpickler(state, self._shared).load()
+        self._run.stretches = stretches_of(self._run)
 
     @cached_property
     def _shared(self) -> list[object]:
@@ -217,9 +219,7 @@ class Environment(ParallelEnv):  # type: ignore[misc] # it has no types
         """Fly until the next decision; raises LearningError where an action is missing, or not finite."""
         self._acts.take(actions, self.agents)
         run, sent = self._run, list(self._run.network.seq)
-        for _ in range(self._every):
-            run.decide(run.time)
-            run.observe(run.time)
+        run.fly_ticks(self._every, everything=self._reward != self._link_error)
         snapshot = run.snapshot(run.time)
         over, hurt = snapshot.time >= self.plan.experiment.duration_s - 0.5 * run.dt, self._hurt(snapshot)
         rewards, infos = dict[str, float](), Infos()
@@ -238,7 +238,7 @@ class Environment(ParallelEnv):  # type: ignore[misc] # it has no types
 
     def view(self, agent: str) -> View:
         """View of an agent, as its law would get it now; once between two steps."""
-        return self._run.robots[self._rows[agent]].view(self._run.time)
+        return self._run.view(self._rows[agent])
 
     def _observations(self) -> dict[str, Array]:
         return {agent: np.array(self._observe(self.view(agent)), dtype=np.float32) for agent in self.agents}

@@ -25,7 +25,7 @@ from experiments.definition.link_conditions import FROM_CENTRE, TO_CENTRE, condi
 from experiments.definition.plan import Plan
 from experiments.recording.trace import EPOCH
 from experiments.virtual_time.steps import words_of
-from experiments.virtual_time.tick import SENT, Ledger, LinkQueue, Member
+from experiments.virtual_time.tick import SENT, Ledger, LinkQueue
 from twins.arrays import Array, Index
 
 
@@ -42,7 +42,7 @@ class Sample(NamedTuple):
     words: Words = ()  # what is said beside a pose
 
 
-Arrived = tuple[int, float, Sample]  # link or row, arrival [s]
+Arrived = tuple[int, float, Sample]  # link, arrival [s]
 
 
 @dataclass(frozen=True)
@@ -222,7 +222,7 @@ class VirtualNetwork:
 
     # ------------------------------------------------------------------ compiled stretches
 
-    def board(self, ways: Sequence[LinkQueue]) -> list[tuple[int, float, Sample]]:
+    def board(self, ways: Sequence[LinkQueue]) -> list[Arrived]:
         """Hand all samples that are under way to the `ways` of their links; returns them."""
         under_way = self._channel.due(inf)
         for way in ways:
@@ -232,17 +232,8 @@ class VirtualNetwork:
             ways[link].put(arrival, sample.seq, sample.stamp, sample.position, sample.velocity, sample.yaw, words)
         return under_way
 
-    def take_back(self, handed: Sequence[Arrived]) -> None:
-        """Samples that were handed to the links of a stretch are under way as before: it was not flown."""
-        for link, arrival, sample in handed:
-            self._channel.put(link, arrival, sample)
-
-    def leave(
-        self, ways: Sequence[LinkQueue], members: Sequence[Member], ledger: Ledger, before: Sequence[Arrived], t: float
-    ) -> None:
-        """Take over what members sent until `t` [s], by their ledger, and what was received of it and of `before`."""
-        for member in members:
-            self.seq[member.row] = member.seq
+    def leave(self, ways: Sequence[LinkQueue], ledger: Ledger, before: Sequence[Arrived], t: float) -> None:
+        """Take over what robots sent until `t` [s], by their ledger, and what was received of it and of `before`."""
         under_way = []
         for link, way in enumerate(ways):
             robot, number = self.receivers[link]

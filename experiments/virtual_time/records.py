@@ -220,20 +220,32 @@ class Image:
     def address(self, thing: Any) -> int:
         return self.known[id(thing)]
 
-    def load(self) -> None:
-        """Read the values of all objects that can change back."""
-        memory = self.memory
-        for thing, layout, at in self.changing:
+    def read(self, things: Iterable[object] | None = None) -> None:
+        """Read the values of some objects back, of those that have a record; or of all, with their lists."""
+        places = self.places
+        if things is not None:
+            for thing in things:
+                if (found := places.get(id(thing))) is not None:
+                    found[1].load(thing, self, found[2])
+            return
+        for thing, layout, at in places.values():
             layout.load(thing, self, at)
         for items, kind, at in self._lists:
-            items[:] = _items(memory, at, len(items), kind)
+            items[:] = _items(self.memory, at, len(items), kind)
+
+    def write(self, things: Iterable[object]) -> None:
+        """Write the values of some objects that have a record."""
+        for thing in things:
+            if (found := self.places.get(id(thing))) is not None:
+                found[1].store(self, thing, found[2])
 
     def _store(self) -> bool:
         """Write the values of all objects; returns whether there is room for them."""
         self.words = np.zeros(self._size, dtype=np.int64)
         self.memory, self._base = self.words.data.cast("B"), self.words.ctypes.data
         self.known: dict[int, int] = {}  # address by identity
-        self.changing: list[tuple[Any, RecordLayout, int]] = []  # objects that can change, each with its place [bytes]
+        # objects that can change, by identity, each with its place [bytes]
+        self.places: dict[int, tuple[Any, RecordLayout, int]] = {}
         self._lists: list[tuple[list[Any], Items, int]] = []
         self.used = 0
         try:
@@ -262,7 +274,7 @@ class Image:
         except (struct.error, AttributeError, LookupError) as error:
             raise TypeError(f"{layout.owner.__name__} has an attribute that has changed its type: {error}") from error
         if not layout.frozen:
-            self.changing.append((thing, layout, at))
+            self.places[id(thing)] = thing, layout, at
         return self._base + at
 
     def measured(self, values: Mapping[str, float]) -> list[float]:

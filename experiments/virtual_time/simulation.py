@@ -6,7 +6,7 @@ is only the loop.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
@@ -18,6 +18,7 @@ from agents.body.interface import BodyState
 from agents.body.shadow_twin import shadowed
 from agents.decision.assignment import Assignment
 from agents.plugins.calls import explain, supervised
+from agents.plugins.law import View
 from agents.plugins.registry import FAILURES
 from agents.robot import Robot
 from agents.safety.hazards import HazardChange
@@ -29,7 +30,7 @@ from experiments.virtual_time.conductor import PATIENCE_S, Stuck, VirtualConduct
 from experiments.virtual_time.network import CentreLog, VirtualNetwork
 from experiments.virtual_time.steps import Steps
 from experiments.virtual_time.stretch import Stretches, TornError, stretches_of
-from experiments.virtual_time.tick import AT_END, AT_HAZARDS, LEAN, PLACES, WIDTH, Ledger
+from experiments.virtual_time.tick import LEAN, PLACES, WIDTH, Ledger
 from twins.arrays import Array, Index
 from twins.body import TwinBody
 from twins.engines.engine import Engine, Touch
@@ -199,11 +200,10 @@ class VirtualRun:
         conductor, dt = self._conductor, self.dt
         first, self.stretches = self.robots[0], stretches
         while not conductor.over:
-            reason = AT_END
-            if stretches is not None and not self.network.retired:
-                self._tick, reason = stretches.fly(self._tick, conductor.next_order(self._tick, dt))
-            t = self._tick * dt
-            self._step(t, reason)
+            self.observe(self.time)
+            self._fly_stretch()
+            t = self.time
+            self._act(t)
             if (first.tick - 1) % self.log_every == 0:  # the robots' count restarts at the common start
                 progress(t - conductor.start_at)
                 if watch is not None:
@@ -212,6 +212,13 @@ class VirtualRun:
             if not landing and t - conductor.start_at >= self.plan.experiment.duration_s - 0.5 * dt:
                 return
             self._end_tick(t)
+
+    def _fly_stretch(self) -> None:
+        """Fly a compiled stretch, where one pays now, from between the halves of this tick to those of another."""
+        if self.stretches is not None and not self.network.retired:
+            self._tick, moves = self.stretches.fly(self._tick, self._conductor.next_order(self._tick, self.dt))
+            if moves:
+                self._detect(self.time)
 
     @property
     def time(self) -> float:
@@ -223,12 +230,13 @@ class VirtualRun:
 
         Raises Stuck if robots do not become ready or airborne, or end before.
         """
+        self.stretches = None if self.twin.together else stretches_of(self)
         while not self._conductor.over:
-            t = self.time
-            self.observe(t)
+            self.observe(self.time)
+            self._fly_stretch()
             if any(robot.begun for robot in self.robots):
-                return t
-            self.decide(t)
+                return self.time
+            self.decide(self.time)
         raise Stuck(f"no robot begins: {self.robots[0].lifecycle.reason}")
 
     def observe(self, t: float) -> None:
@@ -240,6 +248,46 @@ class VirtualRun:
         """Second half of the tick at `t` [s]: goals, setpoints and commands, then the orders of the conductor."""
         self._act(t)
         self._end_tick(t)
+
+    def fly_ticks(self, count: int, *, everything: bool = True) -> None:
+        """Fly `count` ticks from between the halves of this one, compiled where that pays.
+
+        `everything`: all of the robots may be read then; else their states, phases and views alone.
+        """
+        end, stretches = self._tick + count, self.stretches
+        while self._tick < end:
+            if stretches is not None and not self.network.retired:
+                if stretches.open and stretches.end < end:
+                    stretches.leave()
+                if stretches.open or stretches.begin(self._tick, self._conductor.next_order(self._tick, self.dt)):
+                    goes_on = stretches.go(min(end, stretches.end))
+                    self._tick = stretches.tick
+                    if goes_on:
+                        stretches.read(None if everything else self._seen())
+                    elif stretches.leave()[1]:
+                        self._detect(self.time)
+                    continue
+            self.decide(self.time)
+            self.observe(self.time)
+
+    def _seen(self) -> Iterator[object]:
+        """Objects that states, phases and views show."""
+        for robot in self.robots:
+            yield from (robot.now.state, robot.now, robot.lifecycle, robot.goals)
+            yield from robot.goals.rare_parts()
+
+    def view(self, row: int) -> View:
+        """View of a robot, as its law would get it now; once in a tick."""
+        robot, goals = self.robots[row], self.robots[row].goals
+        view = robot.view(self.time)
+        if self.stretches is not None and (goals.changes_shape or goals.itinerary is not None):
+            self.stretches.write([goals, *goals.rare_parts()])
+        return view
+
+    def __getstate__(self) -> dict[str, Any]:
+        if self.stretches is not None and self.stretches.open:
+            self.stretches.leave()
+        return self.__dict__ | {"stretches": None}
 
     def snapshot(self, t: float) -> Snapshot:
         """State of the run at `t` [s]."""
@@ -254,14 +302,6 @@ class VirtualRun:
         self._conductor.give_orders(t, self.dt)
         self.twin.begun_at = self._conductor.start_at
         self._tick += 1
-
-    def _step(self, t: float, reason: int) -> None:
-        """One tick at `t` [s], or the rest of one that a compiled stretch has begun, for this `reason`."""
-        if reason == AT_END:
-            self._receive(t)
-        if reason != AT_HAZARDS:
-            self._detect(t)
-        self._act(t)
 
     def _receive(self, t: float) -> None:
         self._states = self._body.read(t)

@@ -43,20 +43,14 @@ class Steps:
         self._laws = [(each.row, law) for each in members if (law := each.robot.stepping) is not None]
         self.measures = list[str]()  # names of measures
         self.error: BaseException | None = None  # error of a law, or interruption
-        self._begun: Any = None  # words of the records at the beginning
         self.call = CALL(self._call)
         self.address = ctypes.cast(self.call, ctypes.c_void_p).value or 0
 
-    def board(self, image: Image) -> None:
-        """Find the records of a stretch; calls back can be undone, the motion of a world cannot."""
+    def board(self, image: Image, t: float) -> None:
+        """Find the records of a stretch that begins at `t` [s]."""
         self._image, self.error = image, None
-        self._begun = None
         self._rare = {image.address(thing): rare for thing, rare in self._rare_parts()}
-        if self._rare:
-            self._places = {id(thing): (thing, layout, at) for thing, layout, at in image.changing}
-        self.obstacles.clear()
-        if self._rare and self.stage is None:
-            self._begun = image.words.copy()
+        self.obstacles = {t: [tuple(each) for each in self._twin.engine.obstacles]}
 
     def _rare_parts(self) -> Iterator[tuple[object, Rare]]:
         """Objects of which something is called back."""
@@ -80,12 +74,9 @@ class Steps:
 
     def _within(self, rare: Rare, which: int, given: Any) -> None:  # noqa: ANN401 - an array of C
         """Call a rare function between reading and writing records."""
-        image, places = self._image, self._places
-        for thing, layout, at in [places[id(each)] for each in rare.reads if id(each) in places]:
-            layout.load(thing, image, at)
+        self._image.read(rare.reads)
         rare.call(which, given)
-        for thing, layout, at in [places[id(each)] for each in rare.writes if id(each) in places]:
-            layout.store(image, thing, at)
+        self._image.write(rare.writes)
 
     def _advance(self, _: int, given: Any) -> None:  # noqa: ANN401 - an array of C
         """The engine moves all robots on; their sensors see."""
@@ -97,12 +88,6 @@ class Steps:
         for robot in [member.robot for member in self._members] if scanned else ():
             if parts := robot.rare_parts():
                 self._within(Rare(lambda *_, robot=robot: robot.notice(), parts, parts), 0, None)
-
-    def undo(self) -> None:
-        """Take all that was called back in a stretch back, and what was read from the records for it."""
-        if self._begun is not None:
-            self._image.words[:] = self._begun
-            self._image.load()
 
     def columns(self, ledger: Ledger) -> tuple[dict[str, Array], dict[str, Array]]:
         """Memory (K, N, k) and measures (K, N) of all robots at the samples of a stretch, by name."""

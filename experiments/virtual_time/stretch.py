@@ -1,12 +1,14 @@
-"""Stretches of a run in which nothing happens to a robot, flown by functions that are compiled where it pays."""
+"""Stretches of a run in which nothing happens to a robot, flown by functions that are compiled where it pays.
+
+A stretch begins and ends between the two halves of a tick. While it lasts, its robots live in records.
+"""
 
 from __future__ import annotations
 
 import ctypes
 import sys
 from array import array
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
@@ -18,10 +20,10 @@ from agents.plugins.planners import NO_TARGET, Itinerary
 from agents.robot import Robot
 from experiments.definition.plan import Plan
 from experiments.virtual_time import machine, tick
-from experiments.virtual_time.network import VirtualNetwork
+from experiments.virtual_time.network import Arrived, VirtualNetwork
 from experiments.virtual_time.records import Image, Layouts, RecordLayout
 from experiments.virtual_time.steps import Steps
-from experiments.virtual_time.tick import AT_END, Crew, Ledger, LinkQueue, Member, PlannedTargets
+from experiments.virtual_time.tick import Crew, Ledger, LinkQueue, Member, PlannedTargets
 from experiments.virtual_time.translator.kinds import BOOLEAN, DOUBLE, WHOLE, OutsideError
 from experiments.virtual_time.translator.translation import Program
 from twins.body import TwinBody
@@ -40,7 +42,14 @@ LATE, LATEST_S = 40.0, 60.0  # room for jitter: times its mean, of which one in 
 DRIVER: Final = """
 def stretch(crew, k, end, dt, log_every, instant):
     ledger = crew.ledger
+    t = k * dt
     while k < end:
+        {pursue}
+        if (crew.g0[0].robot.tick - 1) % log_every == 0:
+            {note}
+            ledger.times[ledger.sample] = t
+            ledger.sample += 1
+        k += 1
         t = k * dt
         if crew.stage is None:
             {advance}
@@ -52,7 +61,7 @@ def stretch(crew, k, end, dt, log_every, instant):
         moves = False
         {observe}
         if moves:
-            ledger.reason = AT_PHASES
+            ledger.ended = ledger.moves = True
             return k
         {transmit}
         if instant:
@@ -60,14 +69,8 @@ def stretch(crew, k, end, dt, log_every, instant):
         trouble = False
         {detect}
         if trouble:
-            ledger.reason = AT_HAZARDS
+            ledger.ended = True
             return k
-        {pursue}
-        if (crew.g0[0].robot.tick - 1) % log_every == 0:
-            {note}
-            ledger.times[ledger.sample] = t
-            ledger.sample += 1
-        k += 1
     return k
 """
 TYPES: Final[dict[str, Any]] = {WHOLE: ctypes.c_int64, DOUBLE: ctypes.c_double, BOOLEAN: ctypes.c_bool}
@@ -161,6 +164,8 @@ class Stretches:
     flown: int  # ticks so far
     refusal: str  # why nothing can be compiled, empty as long as it can
     called_back: str = ""  # likewise for steps of laws, and changes of the formation
+    tick: int  # tick of the present stretch of which the first half is done
+    end: int  # limit of that
 
     def __init__(self, flight: Flown) -> None:
         self._flight, self._case = flight, msgspec.json.encode(flight.plan.experiment)
@@ -178,82 +183,131 @@ class Stretches:
             way = LinkQueue(sender, channel, ROOM + round((channel.delay + late) * rates.pose_hz), sum(says.values()))
             self._members[sender.sender].ways.append(way)
             self._ways.append(way)
-        self._plans: dict[int, PlannedTargets] = {}
+        self._plans, self._itineraries = dict[int, PlannedTargets](), dict[int, Itinerary]()
         self.flown, self.refusal = 0, ""
         self._prepared: Prepared | None = None
         self._paused_until, self._pause = 0, PAUSE
         self._refused = False
+        self._image: Image | None = None
+        self._before: Sequence[Arrived] = ()
 
-    def fly(self, k: int, end: int) -> tuple[int, int]:
-        """Fly the ticks from `k` on to before `end`; returns the tick at which the stretch ended, and why.
+    @property
+    def open(self) -> bool:
+        """Whether the robots live in records now."""
+        return self._image is not None
 
-        Of a tick that is half done the rest is left to the caller, see `Ledger.reason`.
+    def fly(self, k: int, end: int) -> tuple[int, bool]:
+        """Fly from tick `k`, of which the first half is done, to that of `end`, or until something happens.
+
+        Returns the tick of which the first half is done, and whether that ended early; see `Ledger.moves`.
         """
+        if not self.begin(k, end):
+            return k, False
+        self.go(self.end)
+        return self.leave()
+
+    def begin(self, k: int, end: int) -> bool:
+        """Begin a stretch from tick `k`, of which the first half is done, to `end` at most; returns whether it pays."""
         flight = self._flight
         longest = max(min(LONGEST, ROBOT_TICKS // len(flight.robots)), LEAST)
         end = min(end, k + longest, self._next_leg())
-        if self._refused or k < max(self._paused_until, 1) or end - k < LEAST:  # the first tick moves nothing
-            return k, AT_END
-        if not all(_goes_on(robot, k * flight.dt) for robot in flight.robots):
-            return k, AT_END
+        if self._refused or k < self._paused_until or end - k < LEAST:
+            return False
+        if not all(_goes_on(robot, (k + 1) * flight.dt) for robot in flight.robots):
+            return False
         ticks = end - k
         rates = flight.plan.experiment.rates
         questions = ticks // round(rates.body_hz / rates.pose_hz) + ROOM
         samples = ticks // flight.log_every + ROOM
-        ledger = Ledger(self._members, questions, samples, start=flight.start_at, lean=flight.lean)
+        self._ledger = ledger = Ledger(self._members, questions, samples, start=flight.start_at, lean=flight.lean)
         if not flight.lean:
             for way in self._ways:
                 way.arrivals = array("d", (0.0,)) * questions
         for member in self._members:
             member.seq = flight.network.seq[member.row]
             member.twin.reserve(ticks)
-        before = flight.network.board(self._ways)
-        with self._planned(k, end):
-            last = self._run(ledger, k, end)
-        if last < 0:
-            flight.network.take_back(before)
-            return k, AT_END
-        if last - k < LEAST:
-            self._paused_until, self._pause = last + self._pause, min(2 * self._pause, LONGEST_PAUSE)
-        else:
-            self._pause = PAUSE
-        self.flown += last - k
-        done = last - 1 if ledger.reason == AT_END else last
-        flight.network.leave(self._ways, self._members, ledger, before, done * flight.dt)
-        flight.note(ledger, self._steps)
-        flight.twin.moved_to(done * flight.dt)
-        return last, ledger.reason
-
-    def _run(self, ledger: Ledger, k: int, end: int) -> int:
-        """Run the compiled loop; returns the tick at which it ended, −1 without one or after an error."""
-        flight, prepared = self._flight, self._prepared or RECENT.get(self._case)
-        image, found = None, -1
+        self._before = flight.network.board(self._ways)
+        self._begun, self.tick, self.end = k, k, end
+        self._plan(k, end)
+        prepared = self._prepared or RECENT.get(self._case)
         if prepared is not None and (self._prepared is not None or not prepared.driver.program.changed()):
-            image = self._image(prepared, ledger)
-        if prepared is None or image is None:
+            self._image = self._stored(prepared, ledger)
+        if prepared is None or self._image is None:
             prepared = self._new(ledger)
-            image = self._image(prepared, ledger)
+            self._image = self._stored(prepared, ledger)
         self._prepared, self.refusal = prepared, prepared.driver.refusal or self.refusal
         self.called_back = next(iter(prepared.driver.program.called_back.values()), "")
         if self.refusal:
             REFUSED[str(prepared.layout)] = self.refusal
-        elif image is not None:
-            self._steps.board(image)
-            given = (k, end, flight.dt, flight.log_every, flight.network.instant, self._steps.address)
-            found = prepared.driver.run(image.address(image.roots[0][0]), *given)
-            if found < 0:
-                self._steps.undo()
-            if isinstance(self._steps.error, KeyboardInterrupt):
-                raise self._steps.error
-            if found < 0 and self._steps.stage is not None:
-                raise TornError
-        if found < 0:  # flown plain; that tells an error
+        if self.refusal or self._image is None:
             self._refused = True
-        elif image is not None:
-            image.load()
-        return int(found)
+            self.leave()
+            return False
+        self._steps.board(self._image, k * flight.dt)
+        return True
 
-    def _image(self, prepared: Prepared, ledger: Ledger) -> Image | None:
+    def go(self, end: int) -> bool:
+        """Fly on until the first half of tick `end` is done, of a stretch that has begun; returns False if it ended.
+
+        Raises TornError.
+        """
+        steps, flight, image, prepared = self._steps, self._flight, self._image, self._prepared
+        assert image is not None
+        assert prepared is not None
+        if steps.stage is None:
+            words, samples = image.words.copy(), [array("d", way.samples) for way in self._ways]
+        given = (self.tick, end, flight.dt, flight.log_every, flight.network.instant, steps.address)
+        found = prepared.driver.run(image.address(image.roots[0][0]), *given)
+        if found >= 0:
+            self.tick = found
+            image.read([self._ledger])
+            return not self._ledger.ended
+        if steps.stage is None:
+            image.words[:] = words
+            for way, before in zip(self._ways, samples, strict=True):
+                way.samples[:] = before
+        if isinstance(steps.error, KeyboardInterrupt):
+            raise steps.error
+        if steps.stage is not None:
+            raise TornError
+        self._refused = True  # flown plain; that tells an error
+        return False
+
+    def read(self, things: Iterable[object] | None = None) -> None:
+        """Read some objects of the robots as they are now, or all; changes of them are of no effect, but see `write`.
+
+        Numbers of transmissions are among them.
+        """
+        if self._image is not None:
+            self._image.read(things)
+            self._image.read(self._members)
+        for member in self._members:
+            self._flight.network.seq[member.row] = member.seq
+
+    def write(self, things: Sequence[object]) -> None:
+        """Let changes of these objects take effect."""
+        if self._image is not None:
+            self._image.write(things)
+
+    def leave(self) -> tuple[int, bool]:
+        """End a stretch, and return as `fly`: the robots are as after plain ticks."""
+        flight, ledger, k = self._flight, self._ledger, self.tick
+        self.read()
+        self._image = None
+        for row, itinerary in self._itineraries.items():
+            flight.robots[row].goals.itinerary = itinerary
+        self._itineraries.clear()
+        if k - self._begun < LEAST:
+            self._paused_until, self._pause = k + self._pause, min(2 * self._pause, LONGEST_PAUSE)
+        else:
+            self._pause = PAUSE
+        self.flown += k - self._begun
+        flight.network.leave(self._ways, ledger, self._before, k * flight.dt)
+        flight.note(ledger, self._steps)
+        flight.twin.moved_to(k * flight.dt)
+        return k, ledger.moves
+
+    def _stored(self, prepared: Prepared, ledger: Ledger) -> Image | None:
         """All objects in memory, None if they are not of these layouts."""
         self._steps.measures = prepared.driver.program.measures
         crew = Crew([[self._members[row] for row in rows] for rows in prepared.rows], ledger, self._steps.stage)
@@ -293,15 +347,14 @@ class Stretches:
                 first = min(first, int((begin + itinerary.next_at) / flight.dt) - 1)
         return first
 
-    @contextmanager
-    def _planned(self, k: int, end: int) -> Iterator[None]:
+    def _plan(self, k: int, end: int) -> None:
         """Plans of the robots, computed for all decisions of a stretch, in place of their itineraries."""
-        flight, kept = self._flight, dict[int, Itinerary]()
+        flight = self._flight
         for row, robot in enumerate(flight.robots):
             itinerary = robot.goals.itinerary
             if itinerary is None:
                 continue
-            kept[row] = itinerary
+            self._itineraries[row] = itinerary
             every, begin = robot.assignment.decide_every, robot.lifecycle.start_at
             hz, first = robot.assignment.body_hz / every, robot.tick // every
             place, targets = (np.nan, np.nan, np.nan), []
@@ -311,16 +364,14 @@ class Stretches:
             planned = self._plans.setdefault(row, PlannedTargets(hz))
             planned.first, planned.targets = first, targets
             robot.goals.itinerary = planned  # type: ignore[assignment]
-        try:
-            yield
-        finally:
-            for row, itinerary in kept.items():
-                flight.robots[row].goals.itinerary = itinerary
 
 
 def _goes_on(robot: Robot, t: float) -> bool:
-    """Whether the phase of a robot probably does not move on at `t` [s]: by its last state."""
-    return (robot.lifecycle.phase > READY or robot.lifecycle.climbing) and robot.is_steady(t)
+    """Whether nothing happens to a robot, and its phase probably does not move on at `t` [s]: by its last state."""
+    life = robot.lifecycle
+    if life.moved or robot.takes_off or robot.lands or robot.stops or robot.causes or robot.hazards.under_way:
+        return False
+    return (life.phase > READY or life.climbing) and robot.is_steady(t)
 
 
 def driver(crew: RecordLayout, groups: int, names: Sequence[str], *, often: bool) -> CompiledLoop:

@@ -26,7 +26,6 @@ PLACES: Final = {  # first place of each in those
 }  # fmt: skip
 LEAN: Final = 3  # numbers of a true position alone
 SENT: Final = 10  # numbers of a transmission
-AT_END, AT_PHASES, AT_HAZARDS = 0, 1, 2
 
 
 class LinkQueue:
@@ -134,12 +133,14 @@ class Ledger:
     """Notes of a run."""
 
     __slots__ = (
-        "count", "laws", "lean", "memory", "reason", "rows", "sample", "samples", "sent", "start", "times", "wide",
+        "count", "ended", "laws", "lean", "memory", "moves", "rows", "sample", "samples", "sent", "start", "times",
+        "wide",
     )  # fmt: skip
 
     lean: bool  # True for samples of true positions alone
     start: float  # common start [s], NaN before it is known
-    reason: int  # why a stretch ended: `AT_END`, or with the tick half done `AT_PHASES` or `AT_HAZARDS`
+    ended: bool  # something happens to a robot
+    moves: bool  # the phase of a robot moves on: its tick is done as far as poses are received
     count: int  # transmissions so far
     wide: int  # numbers of a transmission
     sent: array[float]  # row, number, time [s], position [m], velocity [m/s], yaw [rad] and words of each
@@ -158,7 +159,7 @@ class Ledger:
         self.rows = rows = len(members)
         self.lean, self.wide = lean, SENT + max(len(each.words) for each in members)
         self.count, self.sample = 0, 0
-        self.reason = AT_END
+        self.ended = self.moves = False
         self.times = array("d", (0.0,)) * samples
         self.sent = array("d", (0.0,)) * (self.wide * transmissions * rows)
         memories = [each.robot.stepping.memory for each in members if each.robot.stepping is not None]

@@ -17,10 +17,13 @@ from agents.plugins.law import Control, Law
 from agents.plugins.laws import Gradient
 from experiments.catalogue import index
 from experiments.file import document
-from experiments.learning.actions import LearningError
+from experiments.learning import actions
+from experiments.learning.actions import LearningError, Voice
 from experiments.learning.environment import Environment
 from experiments.learning.vector import Environments, SingleAgent
+from experiments.virtual_time import stretch
 from experiments.virtual_time.simulation import VirtualRun
+from tests.experiments.virtual_time.evaluators import alike
 
 
 def distributed_case(name):
@@ -117,6 +120,72 @@ def test_episodes_are_flights(name, seconds):
         assert np.array_equal(places, flown(flight.log(), len(places)))
 
 
+def episodes(made, *, compiled, count=45):
+    """Everything that two episodes show, with a state that is kept in the second one, and the ticks that were compiled.
+
+    Robots go their own ways, some of them into others.
+    """
+    shown, ticks, rng, state = [], 0, np.random.default_rng(4), b""
+    for seed in (3, 4):
+        stretch.WORK[:] = 1e6 if compiled else -1e6, 0.0
+        made.reset(seed=seed)
+        for k in range(count):
+            if not made.agents:
+                break
+            results = made.step({name: rng.uniform(-0.4, 0.4, 3) for name in made.agents})
+            shown.append([{name: np.array(each) for name, each in part.items()} for part in results[:4]])
+            shown[-1].append({name: each["messages"] for name, each in results[4].items()})
+            if seed == 4 and k == 25:
+                state = made.save()
+            if seed == 4 and k == 35:
+                made.reset(options={"state": state})
+        flown = made._run.stretches
+        assert compiled or flown is None
+        ticks += 0 if flown is None else flown.flown + flown.open * (flown.tick - flown._begun)
+    stretch.WORK[:] = 0.0, 0.0
+    return shown, ticks
+
+
+def neighbour_errors(snapshot, row):
+    """A reward by what a robot believes, and of what only all of its state shows."""
+    robot = snapshot.robots[row]
+    return sum(each.position[0] + each.stamp for each in robot.neighbours.all) + robot.setpoint[0] + robot.decisions
+
+
+CASES = {
+    "event-loss": ("policy", "event-loss", {}),
+    "goals": ("policy", "event", {"action": "goal", "starts": 1}),
+    "some agents": ("policy", "periodic", {"agents": ("CF01", "CF03"), "reward": neighbour_errors}),
+    "wheels": ("triangle", "event", {"message_price": 0.1}),
+    "plans": ("convoy", "event", {"observes": "time target position", "reward": neighbour_errors}),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "case", "options"), CASES.values(), ids=CASES)
+def test_compiled_episodes_are_plain_ones(name, case, options):
+    made = Environment(document.read(name), case, talk=True, **options)
+    (plain, _), (compiled, ticks) = (episodes(made, compiled=compiled) for compiled in (False, True))
+    assert alike(tuple(map(tuple, plain)), tuple(map(tuple, compiled)))
+    assert ticks > 500
+
+
+class Growing(Voice, frozen=True, kw_only=True):
+    """A trigger with whole numbers beyond those of C, once the run has lasted."""
+
+    def fires(self, view):
+        return view.since_event > 0.2 or (view.since_start > 1.2 and (1 << 60) * 4 > 7)
+
+
+@pytest.mark.slow
+def test_episodes_outlast_errors_of_compiled_ticks(monkeypatch):
+    monkeypatch.setattr(actions, "Voice", Growing)
+    made = Environment(load("policy", duration_s=3.0), "event-loss", talk=True)
+    (plain, _), (compiled, ticks) = (episodes(made, compiled=compiled, count=28) for compiled in (False, True))
+    assert ticks > 150
+    assert alike(tuple(map(tuple, plain)), tuple(map(tuple, compiled)))
+
+
 def test_bad_input_names_place_and_remedy():
     given, central = load("triangle"), document.read("architectures")
     faults = {
@@ -141,9 +210,9 @@ def test_bad_actions_are_refused_before_they_fly():
         "no agent 'CF1' flies now; did you mean 'CF01'": good | {"CF1": np.zeros(3)},
         "there is none for KH01; give one for each of `env.agents`": {"CF01": np.zeros(3)},
     }
-    for fault, actions in faults.items():
+    for fault, wrong in faults.items():
         with pytest.raises(LearningError, match=fault):
-            made.step(actions)
+            made.step(wrong)
 
 
 def test_states_go_on_to_the_last_bit():

@@ -93,7 +93,7 @@ def test_load_gives_what_was_stored():
     whole = Whole([Part(1.0), Part(2.0)])
     kept = whole.first
     image = stored(whole)
-    image.load()
+    image.read()
     known = whole.count, type(whole.count), whole.ok, whole.fast, whole.name, whole.other
     assert known == (7, int, True, True, "text", None)
     assert type(whole.ok) is bool
@@ -101,9 +101,9 @@ def test_load_gives_what_was_stored():
     assert kept.at == pytest.approx((1.5, 0.0, nan), nan_ok=True)
     assert (whole.numbers, [part.size for part in whole.parts]) == ([1.0, inf], [1.0, 2.0])
     image.words[Layouts().of(whole).offset["count"]] = 9
-    image.load()
+    image.read()
     assert whole.count == 9
     image = stored(frozen := Frozen())
     image.words[:] = 0
-    image.load()
+    image.read()
     assert frozen == Frozen()  # not written

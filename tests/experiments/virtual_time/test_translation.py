@@ -94,7 +94,7 @@ def stretch(series, k):
     run = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p, ctypes.c_int64)(address)
     image = Image([(series, layout)])
     ended = [run(image.address(series), number) for number in range(len(cases))]
-    image.load()
+    image.read()
     numbers = range(len(flat(shape)))
     return [
         None if end < 0 else [getattr(case, f"out{k}") for k in numbers] for case, end in zip(cases, ended, strict=True)
