@@ -114,7 +114,8 @@ class Tracker:
         turn = min(live, key=lambda each: each.whole_at) is tracked
         if tracked.places is None or (t - tracked.whole_at >= period and (turn or not period)):
             tracked.whole_at = t
-            found, tracked.twice = tracked.detector.whole(grey)
+            # tags of bodies that are not seen while others are may be too small
+            found, tracked.twice = tracked.detector.whole(grey, 2 if 0 < len(lost) < len(self._bodies) else 1)
             self._check_places(name, tracked, found)
         boxes = {}
         for body, table in self._bodies.items():

@@ -135,9 +135,12 @@ class TagDetector:
         settings.adaptiveThreshConstant = 10  # noise is no edge
         self._whole = cv2.aruco.ArucoDetector(family, settings)
 
-    def whole(self, grey: Array) -> tuple[dict[int, Array], set[int]]:
-        """Corners (4, 2) by number in a whole image [px], and numbers that are there twice."""
-        found = [*self._find(self._whole, grey)]
+    def whole(self, grey: Array, scale: int = 1) -> tuple[dict[int, Array], set[int]]:
+        """Corners (4, 2) by number in a whole image [px], and numbers that are there twice.
+
+        Enlarged by `scale`, smaller tags are found too; time grows with its square.
+        """
+        found = self._found(self._whole, grey, scale)
         times = Counter(number for number, _ in found)
         return {n: corners for n, corners in found if times[n] == 1}, {n for n in times if times[n] > 1}
 
@@ -150,14 +153,14 @@ class TagDetector:
             part = grey[top:bottom, left:right]
             if min(part.shape) < 16:
                 continue
-            scale = 2 if half < ENLARGED_PX else 1
-            enlarged = cv2.resize(part, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
-            for each, corners in self._find(self._box, enlarged):
+            for each, corners in self._found(self._box, part, 2 if half < ENLARGED_PX else 1):
                 if each == number:
-                    seen[number] = (corners + 0.5) / scale - 0.5 + np.array([left, top])
+                    seen[number] = corners + np.array([left, top])
         return seen
 
-    def _find(self, detector: Any, grey: Array) -> Iterable[tuple[int, Array]]:  # noqa: ANN401 - of OpenCV
-        corners, rows, _ = detector.detectMarkers(grey)
-        for each, row in zip(corners, [] if rows is None else np.ravel(rows).tolist(), strict=True):
-            yield self._numbers[row], np.roll(each.reshape(4, 2).astype(float), self._roll, axis=0)
+    def _found(self, detector: Any, grey: Array, scale: int) -> list[tuple[int, Array]]:  # noqa: ANN401 - of OpenCV
+        enlarged = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+        corners, rows, _ = detector.detectMarkers(enlarged)
+        placed = [np.roll((each.reshape(4, 2) + 0.5) / scale - 0.5, self._roll, axis=0) for each in corners]
+        numbers = [] if rows is None else np.ravel(rows).tolist()
+        return [(self._numbers[row], each) for row, each in zip(numbers, placed, strict=True)]

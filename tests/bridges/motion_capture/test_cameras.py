@@ -250,6 +250,16 @@ def test_calibration_replaces_what_was_measured():
     assert read.bodies == file.parse(content).bodies
 
 
+def test_small_tag_is_found_while_others_are_seen():
+    """A drone on the floor: its tag has 12 px, and is found in enlarged images alone."""
+    seen = lab({"KH01": WHEELS["KH01"], "CF01": DRONES["CF01"]})
+    room, tracker = Room(seen), Tracker(seen, print)
+    poses = {"KH01": (np.array([0.0, 0.2, 0.0]), upright(0.0)), "CF01": (np.array([-0.2, 0.4, 0.0]), upright(0.0))}
+    frames = [tracker.see(name, 0.25 * k, room.image(name, poses)) for k in range(4) for name in "ABCD"]
+    assert frames[-1] is not None
+    assert frames[-1][1]["CF01"].position == pytest.approx((-0.2, 0.4, 0.0), abs=0.003)
+
+
 PLANNED = "A.planned = { place = [-1.7, -1.7, 2.6], aim = [0.0, 0.0, 0.3], view_deg = 83.27 }\n"
 
 
