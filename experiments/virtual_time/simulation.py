@@ -6,6 +6,7 @@ is only the loop.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -213,12 +214,21 @@ class VirtualRun:
                 return
             self._end_tick(t)
 
-    def _fly_stretch(self) -> None:
-        """Fly a compiled stretch, where one pays now, from between the halves of this tick to those of another."""
-        if self.stretches is not None and not self.network.retired:
-            self._tick, moves = self.stretches.fly(self._tick, self._conductor.next_order(self._tick, self.dt))
-            if moves:
-                self._detect(self.time)
+    def _fly_stretch(self, end: int = sys.maxsize) -> bool:
+        """Fly a compiled stretch, where one pays now, from between the halves of this tick to those of another.
+
+        It stays open where it leads beyond tick `end`. Returns whether there was one.
+        """
+        stretches = self.stretches
+        if stretches is None or self.network.retired:
+            return False
+        if not (stretches.open or stretches.begin(self._tick, self._conductor.next_order(self._tick, self.dt))):
+            return False
+        goes_on = stretches.go(min(end, stretches.end))
+        self._tick = stretches.tick
+        if not (goes_on and end < stretches.end) and stretches.leave():
+            self._detect(self.time)
+        return True
 
     @property
     def time(self) -> float:
@@ -254,21 +264,13 @@ class VirtualRun:
 
         `everything`: all of the robots may be read then; else their states, phases and views alone.
         """
-        end, stretches = self._tick + count, self.stretches
+        end = self._tick + count
         while self._tick < end:
-            if stretches is not None and not self.network.retired:
-                if stretches.open and stretches.end < end:
-                    stretches.leave()
-                if stretches.open or stretches.begin(self._tick, self._conductor.next_order(self._tick, self.dt)):
-                    goes_on = stretches.go(min(end, stretches.end))
-                    self._tick = stretches.tick
-                    if goes_on:
-                        stretches.read(None if everything else self._seen())
-                    elif stretches.leave()[1]:
-                        self._detect(self.time)
-                    continue
-            self.decide(self.time)
-            self.observe(self.time)
+            if not self._fly_stretch(end):
+                self.decide(self.time)
+                self.observe(self.time)
+        if self.stretches is not None and self.stretches.open:
+            self.stretches.read(None if everything else self._seen())
 
     def _seen(self) -> Iterator[object]:
         """Objects that states, phases and views show."""

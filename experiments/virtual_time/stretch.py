@@ -196,16 +196,6 @@ class Stretches:
         """Whether the robots live in records now."""
         return self._image is not None
 
-    def fly(self, k: int, end: int) -> tuple[int, bool]:
-        """Fly from tick `k`, of which the first half is done, to that of `end`, or until something happens.
-
-        Returns the tick of which the first half is done, and whether that ended early; see `Ledger.moves`.
-        """
-        if not self.begin(k, end):
-            return k, False
-        self.go(self.end)
-        return self.leave()
-
     def begin(self, k: int, end: int) -> bool:
         """Begin a stretch from tick `k`, of which the first half is done, to `end` at most; returns whether it pays."""
         flight = self._flight
@@ -289,8 +279,8 @@ class Stretches:
         if self._image is not None:
             self._image.write(things)
 
-    def leave(self) -> tuple[int, bool]:
-        """End a stretch, and return as `fly`: the robots are as after plain ticks."""
+    def leave(self) -> bool:
+        """End a stretch: the robots are as after plain ticks; see `Ledger.moves` for what it returns."""
         flight, ledger, k = self._flight, self._ledger, self.tick
         self.read()
         self._image = None
@@ -305,7 +295,7 @@ class Stretches:
         flight.network.leave(self._ways, ledger, self._before, k * flight.dt)
         flight.note(ledger, self._steps)
         flight.twin.moved_to(k * flight.dt)
-        return k, ledger.moves
+        return ledger.moves
 
     def _stored(self, prepared: Prepared, ledger: Ledger) -> Image | None:
         """All objects in memory, None if they are not of these layouts."""
