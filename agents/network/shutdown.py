@@ -20,7 +20,6 @@ from agents.network import pubsub
 from agents.network.keys import Keys
 
 LEAVE_S: Final = 1.0
-LEAVING: Final = "leaving the network"
 
 
 def leave(session: zenoh.Session, *declared: object, limit_s: float = LEAVE_S) -> bool:
@@ -28,7 +27,7 @@ def leave(session: zenoh.Session, *declared: object, limit_s: float = LEAVE_S) -
 
     `declared` own entities of the session: kept until it is closed, because dropping an entity waits as well.
     """
-    closing = threading.Thread(target=_close, args=(session, declared), name=LEAVING, daemon=True)
+    closing = threading.Thread(target=_close, args=(session, declared), name="leaving the network", daemon=True)
     closing.start()
     closing.join(limit_s)
     return not closing.is_alive()
@@ -49,8 +48,12 @@ def closing_cleanly(session: zenoh.Session) -> Iterator[tuple[zenoh.Session, lis
 
 
 def end(code: int) -> NoReturn:
-    """Ends the process, at once if it is still leaving the network."""
-    if any(thread.name == LEAVING for thread in threading.enumerate()):
+    """Ends the process, at once if a daemon thread of it is alive.
+
+    The interpreter would end that thread wherever it is: inside Zenoh, as when a router asks itself or a session is
+    still closing, the process would end by SIGABRT ("FATAL: exception not rethrown").
+    """
+    if any(thread.daemon for thread in threading.enumerate()):
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)

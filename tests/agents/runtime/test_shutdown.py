@@ -18,6 +18,7 @@ from agents.decision.lifecycle import Phase
 from agents.network import messages
 from agents.network.keys import Keys
 from agents.network.name_ownership import NameKeeper
+from agents.network.shutdown import end
 from agents.robot import Robot
 from agents.runtime import loop, watchdog
 from agents.runtime.descent import Descent, DescentTiming
@@ -271,3 +272,14 @@ def test_frozen_process_is_no_hanging_loop():
     assert before == "over"
     assert alarm.startswith("its control loop hangs: no tick for ")
     assert "landed" in rest
+
+
+@pytest.mark.parametrize(("daemon", "at_once"), [(False, []), (True, [4])])
+def test_no_daemon_thread_outlives_the_interpreter(monkeypatch, daemon, at_once):
+    """Inside Zenoh it would take the process along, by SIGABRT."""
+    ended = []
+    monkeypatch.setattr(os, "_exit", ended.append)
+    monkeypatch.setattr(threading, "enumerate", lambda: [threading.main_thread(), threading.Thread(daemon=daemon)])
+    with pytest.raises(SystemExit, match="4"):
+        end(4)
+    assert ended == at_once
