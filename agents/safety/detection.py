@@ -404,9 +404,7 @@ class Detector:
                 "it does not rise" if ascent.stalled else f"{motion_check.commanded:.2f} m commanded in vain"
             ),
             Cause.STRAYING: lambda: (
-                f"{ascent.aside:.2f} m aside while it climbs"
-                if ascent.carried
-                else f"{motion_check.drifted:.2f} m lately"
+                f"{ascent.aside:.2f} m aside while it climbs" if ascent.carried else motion_check.words()
             ),
             Cause.UNREACHABLE: lambda: f"for {t - state.received:.1f} s",
             Cause.HOVERING: lambda: f"at {now.position[2]:.2f} m",

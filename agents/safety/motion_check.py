@@ -5,7 +5,11 @@ along the nose. It is added up on every tick, because a setpoint of slow decisio
 the next. Commanded and measured motion are compared over pieces of half a second, so that neither the rate of the
 measured positions nor their resolution matters.
 
-Quiet: all of it.
+A turn of the wrong sign, or swapped wheels, need not lead far away. They show in the correlation of commanded and
+measured motion, however slow: right bodies have 0.9 to 1, with commands that take effect 0.6 s late at least -0.35.
+A wind carries drones against slow commands, so that the way of those is judged by its length alone.
+
+Quiet: all but `words`.
 """
 
 from __future__ import annotations
@@ -30,6 +34,12 @@ RUSH_S: Final = 0.5  # tolerated uncommanded travel, in seconds at top speed, be
 ROUNDING_S: Final = 1e-6
 OUTSIDE_M: Final = 0.4  # [m] the same of robots that fly on board by positions from outside, which may ring
 TURN: Final = 1.5  # tolerated uncommanded rotation of a wheeled robot [rad]
+REMEMBER_S: Final = 10.0  # time after which the correlation forgets a piece
+REMEMBERED: Final = 1.0 - PIECE_S / REMEMBER_S  # share of earlier pieces that a piece keeps
+LEAST_WAY, LEAST_TURN = 0.03, 0.1  # least sums of squared commanded pieces [m²], [rad²]: smaller ones are noise
+ALIKE: Final = 4.0  # largest ratio of the sums of measured and commanded squares: noise, a push or a wall
+AGAINST_WAY, AGAINST_TURN = 0.0, -0.5  # correlations below which a robot moves against its commands
+HALF_TURN: Final = 2.5  # [rad] faster turns of a piece have no certain sign
 
 
 class MotionCheck:
@@ -38,15 +48,18 @@ class MotionCheck:
     # more than CPython keeps beside an object: the tick would look each up in a dictionary
     __slots__ = (
         "anchor", "anchor_yaw", "begin", "begin_yaw", "by_position", "by_twist", "commanded", "commanded_s",
-        "commanded_turn", "drift", "drifted", "due", "flies", "free", "last", "response", "rim", "samples",
-        "slow", "speed", "turn", "turn_before", "unanswered", "unanswered_turn", "uncommanded",
-        "uncommanded_turn", "unresponsive", "way", "way_before", "without", "x", "y", "z",
+        "commanded_turn", "drift", "drifted", "due", "expected_turn", "expected_x", "expected_y", "flies", "follows",
+        "free", "last", "late_turn", "late_x", "late_y", "response", "rim", "samples", "slow", "speed", "turn",
+        "turn_before", "turned", "turned_asked", "turned_both", "turns_against", "unanswered", "unanswered_turn",
+        "uncommanded", "uncommanded_turn", "unresponsive", "way", "way_against", "way_asked", "way_before",
+        "way_both", "way_moved", "without", "x", "y", "z",
     )  # fmt: skip
 
     def __init__(self, kind: Kind, *, outside: bool = False) -> None:
         """`outside`: of a robot that flies on board by positions from outside."""
         self.flies, self.speed, self.response = kind.flies, kind.speed, kind.response
         self.by_position, self.by_twist = kind.takes == "position", kind.takes == "twist"
+        self.follows = SAMPLE_S / (SAMPLE_S + kind.lag)  # share of a commanded change that a sample follows
         self.rim = 0.0 if kind.flies else kind.radius  # [m] turning moves wheels by it
         self.slow = (SLOW_FLIES if kind.flies else SLOW_WHEELS) * kind.speed  # slower: no command to move [m/s]
         # least commanded travel without motion that counts [m]
@@ -67,6 +80,10 @@ class MotionCheck:
         self.turn = self.turn_before = 0.0
         self.drift, self.drifted = ZERO, 0.0  # recent uncommanded travel [m], and its length [m]
         self.uncommanded_turn = 0.0  # recent uncommanded rotation [rad]
+        # commanded motion with the lag of the body, of the last sample and of the piece [m], [rad]
+        self.late_x = self.late_y = self.late_turn = 0.0
+        self.expected_x = self.expected_y = self.expected_turn = 0.0
+        self.forget_sums()
         # commanded since its last motion: travel not moved [m], time less the pauses [s], way [m] and turn [rad]
         self.commanded = self.commanded_s = 0.0
         self.unanswered, self.unanswered_turn = ZERO, 0.0
@@ -75,6 +92,13 @@ class MotionCheck:
         known = is_finite(position) and isfinite(yaw)
         self.begin = self.anchor = position if known else UNKNOWN
         self.begin_yaw = self.anchor_yaw = yaw
+
+    def forget_sums(self) -> None:
+        """Restart the correlation of commanded and measured motion."""
+        self.way_against = self.turns_against = False  # it moves or turns against its commands
+        # sums over pieces: products of both, squares of commanded and of measured ones [m²], [rad²]
+        self.way_both = self.way_asked = self.way_moved = 0.0
+        self.turned_both = self.turned_asked = self.turned = 0.0
 
     def update(self, t: float, setpoint: Setpoint, position: Vector, yaw: float, watched: bool) -> None:
         """Add up the commanded motion, and compare at the end of each sample; call it on every tick, at `t` [s].
@@ -115,7 +139,7 @@ class MotionCheck:
                 self.x += cos(yaw) * v * since
                 self.y += sin(yaw) * v * since
         else:
-            turn = 0.0 if self.flies else setpoint[3]
+            turn = setpoint[3]
             if isfinite(setpoint[0]):
                 self.x += setpoint[0] * since
             if isfinite(setpoint[1]):
@@ -137,6 +161,13 @@ class MotionCheck:
         before = self.way
         self.way = before[0] + way[0], before[1] + way[1], before[2] + way[2]
         self.turn += turn
+        follows = self.follows
+        self.late_x += follows * (way[0] - self.late_x)
+        self.late_y += follows * (way[1] - self.late_y)
+        self.late_turn += follows * (turn - self.late_turn)
+        self.expected_x += self.late_x
+        self.expected_y += self.late_y
+        self.expected_turn += self.late_turn
         self.count_unresponsive(position, yaw, way, turn)
         self.samples += 1
         if self.samples >= PIECE:
@@ -177,7 +208,9 @@ class MotionCheck:
         if norm(moved) > 4.0 * self.speed * PIECE_S:
             # no robot is so fast: it was moved in the world, or its position comes from something else now
             self.drift, self.uncommanded_turn = ZERO, 0.0
+            self.forget_sums()
         else:
+            self.correlate(moved[0], moved[1], wrap(yaw - self.begin_yaw))
             drift = self.drift
             self.drift = (
                 KEPT * drift[0] + moved[0] - obeyed * toward[0],
@@ -189,7 +222,39 @@ class MotionCheck:
                 stray = turned - clamp(turned, min(commanded, 0.0), max(commanded, 0.0))
                 self.uncommanded_turn = KEPT * self.uncommanded_turn + stray
         self.drifted = norm(self.drift)
-        self.uncommanded = self.drifted > self.free or abs(self.uncommanded_turn) > TURN
+        self.uncommanded = (
+            self.drifted > self.free
+            or abs(self.uncommanded_turn) > TURN
+            or self.turns_against
+            or (self.way_against and not self.flies)
+        )
+        self.expected_x = self.expected_y = self.expected_turn = 0.0
         self.way_before, self.turn_before = self.way, self.turn
         self.way, self.turn = ZERO, 0.0
         self.begin, self.begin_yaw = position, yaw
+
+    def correlate(self, x: float, y: float, turned: float) -> None:
+        """Correlate the measured motion of a piece, x, y [m] and `turned` [rad], with the commanded one."""
+        ask_x, ask_y, ask = self.expected_x, self.expected_y, self.expected_turn
+        self.way_both = REMEMBERED * self.way_both + ask_x * x + ask_y * y
+        self.way_asked = REMEMBERED * self.way_asked + ask_x * ask_x + ask_y * ask_y
+        self.way_moved = REMEMBERED * self.way_moved + x * x + y * y
+        asked, moved = self.way_asked, self.way_moved
+        judged = asked > LEAST_WAY and asked < ALIKE * moved and moved < ALIKE * asked
+        self.way_against = judged and self.way_both < AGAINST_WAY * sqrt(asked * moved)
+        if abs(ask) < HALF_TURN:
+            self.turned_both = REMEMBERED * self.turned_both + ask * turned
+            self.turned_asked = REMEMBERED * self.turned_asked + ask * ask
+            self.turned = REMEMBERED * self.turned + turned * turned
+        asked, moved = self.turned_asked, self.turned
+        judged = asked > LEAST_TURN and asked < ALIKE * moved and moved < ALIKE * asked
+        self.turns_against = judged and self.turned_both < AGAINST_TURN * sqrt(asked * moved)
+
+    def words(self) -> str:
+        """Extent of uncommanded motion, with its probable cause; rare."""
+        if self.turns_against:
+            return "it turns against its commands; is the sign of its turn wrong, are its wheels swapped?"
+        if self.way_against:
+            blown = ", or does a wind carry it" if self.flies else ""
+            return f"{self.drifted:.2f} m lately, against its commands; are its axes swapped or mirrored{blown}?"
+        return f"{self.drifted:.2f} m lately"

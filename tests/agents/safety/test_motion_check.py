@@ -92,6 +92,37 @@ def test_robot_that_moves_without_being_told(kind):
     assert robot.go(3.0) == FINE
 
 
+def sways(robot, seconds, *, sign, ways=0.0, turns=0.0):
+    """A robot that goes to and fro slowly, its motion that of its commands times a sign; returns when it is found."""
+    for second in range(seconds):
+        way = (-1) ** (second // 2)
+        given = {"told": way * ways, "speed": sign * way * ways, "told_turn": way * turns, "turn": sign * way * turns}
+        if True in robot.go(1.0, **given):
+            return second
+    return None
+
+
+@wheels
+def test_slow_motion_against_commands_is_found(kind):
+    for given, most in (({"turns": 0.3}, 8), ({"ways": 0.1}, 14)):
+        assert sways(Told(kind), 60, sign=1.0, **given) is None
+        found = Told(kind)
+        assert sways(found, 60, sign=-1.0, **given) <= most
+        assert found.motion_check.words().partition("its commands; ")[2]
+    for given in ({"turns": 0.05}, {"ways": 0.01}):  # motion as small as noise
+        assert sways(Told(kind), 60, sign=-1.0, **given) is None
+
+
+@every_kind
+def test_late_motion_is_not_against_commands(kind):
+    """Commands to and fro in a second or more, that take effect 0.3 s later."""
+    robot, late = Told(kind), [0.0] * 30
+    for tick in range(6000):
+        late.append(math.sin(2.0 * math.pi * DT * tick / 4.0))
+        now, then = 0.2 * kind.speed * late[-1], 0.2 * kind.speed * late[-31]
+        assert robot.go(DT, told=now, speed=then, told_turn=late[-1], turn=late[-31]) == FINE
+
+
 @every_kind
 @pytest.mark.parametrize(
     ("setpoint", "speed", "watched"),
