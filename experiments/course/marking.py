@@ -3,7 +3,7 @@
 The code of a group runs in a process of its own, with limits of computing time, memory and size of files, in a folder
 that is gone afterwards. Criteria, metrics and all but the blanks are those of the course. The process says its result
 by a pipe at its end: one that ends otherwise has not passed. That keeps out mistakes. It is no prison: code that is
-written to deceive or to harm could do both.
+written to deceive or to harm could do both. However the marking ends, a guard ends these processes with it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple, NoReturn
@@ -113,23 +113,68 @@ def marks(
     works = [_Work(SOLUTION, each, course.solved) for each in exercises]
     works += [_handed_in(each, folder.resolve()) for folder in groups for each in exercises]
     running: dict[int, _Process] = {}  # processes by their pipes
-    with selectors.DefaultSelector() as answers, tempfile.TemporaryDirectory(prefix="zenpark-mark-") as folder:
+    with (
+        tempfile.TemporaryDirectory(prefix="zenpark-mark-") as folder,
+        selectors.DefaultSelector() as answers,
+        _guarded() as guard,
+    ):
         try:
             for number, work in enumerate(works):
                 if work.fault or not work.texts:
                     yield work.failed(work.fault) if work.fault else Mark(work.group, work.exercise.name)
                     continue
                 while len(running) >= (cores()):
-                    yield from _ended(running, answers, limits)
+                    yield from _ended(running, answers, limits, guard)
                 place = Path(folder) / str(number)
-                pipe, process = _begun(work, partial(_mark, course, work, seeds, place), place, limits)
+                pipe, process = _begun(work, partial(_mark, course, work, seeds, place), place, limits, guard)
                 running[pipe] = process
                 answers.register(pipe, selectors.EVENT_READ)
             while running:
-                yield from _ended(running, answers, limits)
+                yield from _ended(running, answers, limits, guard)
         finally:
             for pipe, process in running.items():
-                _end(pipe, process)
+                _end(pipe, process, guard)
+
+
+@contextmanager
+def _guarded() -> Iterator[int]:
+    """A process that ends those of the groups when this one is gone; yields its pipe, see `_guard`."""
+    reading, writing = os.pipe()
+    number = os.fork()
+    if number == 0:
+        _guard(reading)
+    os.close(reading)
+    try:
+        yield writing
+    finally:
+        os.close(writing)
+        os.waitpid(number, 0)
+
+
+def _guard(pipe: int) -> NoReturn:
+    """Read numbers of process groups from a pipe, negative ones of those that ended; end the others at its end."""
+    end = os._exit
+    try:
+        os.setsid()  # a Ctrl-C of the terminal is not for it
+        for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(each, signal.SIG_IGN)
+        quiet = os.open(os.devnull, os.O_RDWR)
+        for number in (0, 1, 2):  # a reader of the output waits for no guard
+            os.dup2(quiet, number)
+        os.closerange(3, pipe)
+        os.closerange(pipe + 1, MOST_FILES)
+        groups = set[int]()
+        with os.fdopen(pipe, "rb") as lines:
+            for line in lines:
+                if (number := int(line)) > 0:
+                    groups.add(number)
+                else:
+                    groups.discard(-number)
+        for number in groups:
+            with suppress(ProcessLookupError, PermissionError):
+                os.killpg(number, signal.SIGKILL)
+    finally:
+        end(0)
 
 
 def _handed_in(exercise: Exercise, folder: Path) -> _Work:
@@ -140,7 +185,7 @@ def _handed_in(exercise: Exercise, folder: Path) -> _Work:
         return _Work(folder.name, exercise, {}, str(error))
 
 
-def _begun(work: _Work, task: Callable[[], Mark], folder: Path, limits: Allowance) -> tuple[int, _Process]:
+def _begun(work: _Work, task: Callable[[], Mark], folder: Path, limits: Allowance, guard: int) -> tuple[int, _Process]:
     """A process that does a task in limits, and the pipe by which it says the mark."""
     sys.stdout.flush()
     sys.stderr.flush()
@@ -149,16 +194,17 @@ def _begun(work: _Work, task: Callable[[], Mark], folder: Path, limits: Allowanc
     until = time.monotonic() + 2 * limits.cpu_s
     number = os.fork()
     if number == 0:
-        _do(task, folder, writing, limits)
+        _do(task, folder, writing, limits, guard)
     os.close(writing)
     return reading, _Process(number, work, until, bytearray())
 
 
-def _do(task: Callable[[], Mark], folder: Path, pipe: int, limits: Allowance) -> NoReturn:
+def _do(task: Callable[[], Mark], folder: Path, pipe: int, limits: Allowance, guard: int) -> NoReturn:
     """Do a task in this process, which was forked for it and ends with it."""
     end, code = os._exit, 1
     try:
         os.setsid()
+        os.write(guard, b"%d\n" % os.getpid())
         for each in (signal.SIGINT, signal.SIGTERM):
             signal.signal(each, signal.SIG_DFL)
         os.chdir(folder)
@@ -202,7 +248,9 @@ def _mark(course: Course, work: _Work, seeds: Sequence[int], folder: Path) -> Ma
         return work.failed(f"{type(error).__name__}: {error}")
 
 
-def _ended(running: dict[int, _Process], answers: selectors.BaseSelector, limits: Allowance) -> Iterator[Mark]:
+def _ended(
+    running: dict[int, _Process], answers: selectors.BaseSelector, limits: Allowance, guard: int
+) -> Iterator[Mark]:
     """Marks of the processes that end next, or that are ended for they took too long."""
     wait_s = min(each.until for each in running.values()) - time.monotonic()
     for key, _ in answers.select(max(wait_s, 0.0)):
@@ -211,21 +259,23 @@ def _ended(running: dict[int, _Process], answers: selectors.BaseSelector, limits
         process.said.extend(said)
         if not said or len(process.said) > LONGEST:
             answers.unregister(key.fd)
-            yield _result(process, _end(key.fd, running.pop(key.fd)), limits)
+            yield _result(process, _end(key.fd, running.pop(key.fd), guard), limits)
     for pipe, process in [*running.items()]:
         if time.monotonic() > process.until:
             answers.unregister(pipe)
-            _end(pipe, running.pop(pipe))
+            _end(pipe, running.pop(pipe), guard)
             yield process.work.failed(f"took more than {2 * limits.cpu_s} s")
 
 
-def _end(pipe: int, process: _Process) -> int:
+def _end(pipe: int, process: _Process, guard: int) -> int:
     """End a process with all that it began; returns its status."""
     with suppress(ProcessLookupError):  # its group may be gone, or not there yet
         os.killpg(process.number, signal.SIGKILL)
     with suppress(ProcessLookupError):
         os.kill(process.number, signal.SIGKILL)
     os.close(pipe)
+    with suppress(OSError):  # a guard that is gone
+        os.write(guard, b"-%d\n" % process.number)  # as long as no other process can have its number
     return os.waitpid(process.number, 0)[1]
 
 

@@ -1,12 +1,15 @@
 """Exercises are made from their solutions; whatever the code of a group does, it passes by its criteria alone."""
 
 import json
+import signal
 from pathlib import Path
 
+import psutil
 import pytest
 
 from experiments.course.exercises import CourseError, posed, read_course, write, write_exercises
-from tests.commands import invoke, zenpark
+from tests.commands import GUARD, environment, invoke, started, zenpark
+from tests.waiting import until
 
 FILE = """
 title = "Two robots meet"
@@ -148,3 +151,20 @@ def test_wrong_calls_are_refused(course, tmp_path):
     }.items():
         assert said in str(invoke("mark", *words, "--from", course, code=1).exception)
     assert "holds no exercise" in str(invoke("course", tmp_path / "new", "--from", tmp_path, code=1).exception)
+
+
+FORKS = "(os.fork() or open('begun', 'x'), time.sleep(600))"  # with a child of its own
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL, signal.SIGINT])
+def test_marking_that_ends_leaves_no_process(course, tmp_path, number):
+    write({"meet.toml": FILE, "meet.py": LAW.replace(LINE, FORKS)}, tmp_path / "sleeps")
+    words = ("mark", tmp_path / "sleeps", "--from", course, "--seeds", 1)
+    with started(*GUARD, *words, env=environment(TMPDIR=str(tmp_path))) as marking:
+        until(lambda: list(tmp_path.glob("zenpark-mark-*/*/begun")), "the law sleeps")
+        processes = psutil.Process(marking.pid).children(recursive=True)
+        assert len(processes) >= 3  # guard, law and its child
+        marking.send_signal(number)
+        marking.wait()
+        until(lambda: not any(map(psutil.Process.is_running, processes)), "all are gone")
