@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,11 +12,13 @@ from pathlib import Path
 import msgspec
 
 from agents.decision.lifecycle import LANDING, TOLD_TO_END
+from agents.vectors import Vector
 from experiments.recording import playback
 from tests.simulated.kernel import KILLED, Process
 from tests.simulated.look import AT_THE_END, Look, rule
 from tests.simulated.world import LOOK_S, OUTSIDE, World
 
+TRUE_M = 0.05  # [m] difference of figures and true motions, which are sampled at other moments
 ASKED = ("finished", "ordered to", "emergency", "asked to")  # reasons to land that are no faults
 
 
@@ -161,6 +164,43 @@ def no_success_of_a_part(end: End) -> Iterator[str]:
     for case in msgspec.json.decode(metrics.read_bytes()) if end.code == 0 and metrics.is_file() else ():
         if case["interrupted"]:
             yield f"{case['case']}: figures of {case['duration_s']:.1f} of {case['planned_s']:g} s"
+
+
+@rule(AT_THE_END, "")
+def figures_are_true(end: End) -> Iterator[str]:
+    """With exit code 0 the figures agree with the true motions of the bodies."""
+    metrics, plan = end.folder / "metrics.json", end.world.plan
+    if end.code != 0 or plan is None or not metrics.is_file():
+        return
+    (case,) = msgspec.json.decode(metrics.read_bytes())
+    places: dict[float, dict[str, Vector]] = {}  # true places [m] by time and robot
+    for name in plan.names:
+        for t, position, *_ in end.world.samples.get(name, ()):
+            if 0.0 <= t - end.start <= end.duration_s:
+                places.setdefault(t, {})[name] = position
+    pairs = [pair for each in places.values() for pair in itertools.combinations(each.items(), 2)]
+    closest = min((math.dist(p, q) for (_, p), (_, q) in pairs), default=inf)
+    told = case["mean"]["closest"]
+    if told is not None and abs(told - closest) > TRUE_M:
+        yield f"closest robots {told:.3f} m, truly {closest:.3f} m"
+    size = plan.experiment.arena.size
+    beyond = [
+        max(abs(x) - 0.5 * size[0], abs(y) - 0.5 * size[1], z - size[2])
+        for each in places.values()
+        for x, y, z in each.values()
+    ]
+    outside = max(beyond, default=0.0)
+    if abs(case["excursion"] - max(outside, 0.0)) > TRUE_M:
+        yield f"{case['excursion']:.3f} m outside the arena, truly {outside:.3f} m"
+    kinds = dict(zip(plan.names, plan.kinds, strict=True))
+    touching = {
+        tuple(sorted((one, other)))
+        for (one, p), (other, q) in pairs
+        if math.dist(p[:2], q[:2]) < kinds[one].radius + kinds[other].radius - TRUE_M
+        and abs(p[2] - q[2]) < min(kinds[one].height, kinds[other].height)
+    }
+    if missing := touching - {tuple(sorted((each["first"], each["second"]))) for each in case["collisions"]}:
+        yield f"contacts that no figure tells: {sorted(missing)}"
 
 
 @rule(AT_THE_END, "An emergency stop ends the whole run")

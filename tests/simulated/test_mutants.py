@@ -134,6 +134,10 @@ MUTANTS = {
     "broken recording is no matter": (
         MEASURE, "if ended_early(trace) and not", "if False and not", run("recorder_hangs_to_the_end"),
     ),
+    "wrong distances of robots": (
+        "experiments/metrics/signals.py", "norm(position[:, i + 1 :] - position[:, i, None])",
+        "norm(position[:, i + 1 :])", run("shortly_held"),
+    ),
     "long hold is no matter": (MEASURE, "if ordered > HELD * end:", "if ordered > end:", run("held")),
     "suspension unnoticed": (
         LOOP, "if missed * self._dt > self._setup.loop_timeout_s:", "if missed * self._dt > 99.0:",
