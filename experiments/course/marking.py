@@ -275,7 +275,7 @@ def _end(pipe: int, process: _Process, guard: int) -> int:
         os.kill(process.number, signal.SIGKILL)
     os.close(pipe)
     with suppress(OSError):  # a guard that is gone
-        os.write(guard, b"-%d\n" % process.number)  # as long as no other process can have its number
+        os.write(guard, b"-%d\n" % process.number)  # no other process has its number yet
     return os.waitpid(process.number, 0)[1]
 
 
