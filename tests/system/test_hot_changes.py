@@ -109,7 +109,7 @@ def test_present_robot_is_adopted_unless_it_has_flown(router, watcher, tmp_path)
     ):
         watcher.until(lambda: "CF01" in watcher.alive, "it is there")
         flight = Flight(tmp_path / "run", file, *SHORT)
-        flight.until_said("adopted CF01(, KH02)?: is there already, idle")  # one line for both, if both are idle by then
+        flight.until_said("adopted CF01(, KH02)?: is there already, idle")  # one line, if both are idle by then
         flight.until_said("adopted (CF01, )?KH02: is ")
         watcher.until_all("running", "KH02")
         assert at_boot.wait() == 0, "with --once it ends when it is down, so that its service starts it anew"
