@@ -23,6 +23,7 @@ PROMISE: Final = re.compile(
 HAZARDS = "agents/safety/test_hazards.py::test_outcomes_of_a_lasting_cause"
 CAUSES = "agents/safety/test_detection.py::test_causes_of_one_tick"
 CAPTURED = "agents/body/test_measured_positions.py::test_"
+LOCKS = "agents/body/test_device_locks.py::test_"
 MISLED = "agents/safety/test_misleading_positions.py::test_"
 MOTION = "agents/safety/test_motion_check.py::test_"
 POSES = "agents/runtime/test_pose_inbox.py::test_"
@@ -71,6 +72,8 @@ SAFETY: Final = {
     "land after 0.5 s; an interruption of less than a second": HAZARDS,
     "in at least 2 s its setpoints (without slow ones) add up to 1.5 s": f"{MOTION}robot_that_does_not_move",
     "(0.75 s on wheels)": f"{MOTION}wheels_that_ignore_or_need_no_commands",
+    "motion over 10 s": f"{MOTION}slow_motion_against_commands_is_found",
+    "take effect 0.6 s late": f"{MOTION}late_motion_is_not_against_commands",
     "rise by 5 cm in 4 s (Tello: 10 s": "agents/safety/test_detection.py::test_climb_without_measured_height",
     "halt after 2 s more": f"{ROW}[stuck_wheels]",
     "counts for about 5 s": f"{MOTION}robot_that_moves_without_being_told",
@@ -96,7 +99,8 @@ SAFETY: Final = {
     "every half second": f"{SCRIPT}stop_without_router_goes_by_lifelines",
     "land after 3 s without its heartbeat": f"{HOST}frozen_launcher_lands_all_and_gives_no_order",
     "and always `tcp/127.0.0.1:7447`": "tools/commands/test_network.py::test_estop_reaches_each_realm_of_a_router",
-    "sends nothing and ends with 2": "agents/body/test_fleet.py::test_holder_is_named_and_its_death_frees_device",
+    "Name servers have 2 s": f"{LOCKS}silent_name_server_delays_no_robot_for_long",
+    "sends nothing and ends with 2": f"{LOCKS}holder_is_named_and_its_death_frees_device",
     "2.5 s without that the status": f"{SCRIPT}stop_that_no_body_confirms_is_told",
     "waits for it (5 s; wheels 3 s)": f"{SCRIPT}stop_that_no_body_obeys_is_told",
     "Two measurements never do": f"{CAPTURED}frozen_motion_capture_lands_what_flies",

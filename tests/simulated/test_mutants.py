@@ -35,7 +35,7 @@ MUTANTS = {
     ),
     "empty answer not asked for again": (
         OWNERSHIP, "if tokens or tokens is None:", "if True:",
-        partial(test_safety.test_two_robots_of_a_process_keep_their_names, 1),
+        partial(test_safety.test_two_robots_of_a_process_keep_their_names, 2),
     ),
     "stop left to the loop": (
         LOOP, "        if self._opened:\n            self._body.stop", "        if False:\n            self._body.stop",
@@ -46,7 +46,7 @@ MUTANTS = {
         partial(row, "cut_shortly"),
     ),
     "vanished token not forgotten": (
-        f"{RUNTIME}pose_order.py", "+ ([session] if there else [])", "+ [session]",
+        f"{RUNTIME}pose_order.py", "+ ([session] if stands else [])", "+ [session]",
         test_changes.test_killed_robot_is_restarted_and_takes_part,
     ),
     "end of the lifeline ignored": (
@@ -116,7 +116,7 @@ MUTANTS = {
         test_safety.test_lost_order_to_land_is_repeated,
     ),
     "unconfirmed stop is no matter": (
-        "bridges/external.py", "- robot.stopped_since > ANSWER_S", "- robot.stopped_since > 99.0",
+        "bridges/external.py", "- robot.stopped_since > UNANSWERED_S", "- robot.stopped_since > 99.0",
         test_safety.test_stop_that_no_body_confirms_is_told,
     ),
     "jump believed": (
