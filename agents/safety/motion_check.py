@@ -6,8 +6,9 @@ the next. Commanded and measured motion are compared over pieces of half a secon
 measured positions nor their resolution matters.
 
 A turn of the wrong sign, or swapped wheels, need not lead far away. They show in the correlation of commanded and
-measured motion, however slow: right bodies have 0.9 to 1, with commands that take effect 0.6 s late at least -0.35.
-A wind carries drones against slow commands, so that the way of those is judged by its length alone.
+measured motion, however slow. Commands that take effect late let a right body move against those of the moment, if they
+alternate: only who moves against those of the piece before as well is wrong. A wind carries drones against slow
+commands, so that the way of those is judged by its length alone.
 
 Quiet: all but `words`.
 """
@@ -38,7 +39,7 @@ REMEMBER_S: Final = 10.0  # time after which the correlation forgets a piece
 REMEMBERED: Final = 1.0 - PIECE_S / REMEMBER_S  # share of earlier pieces that a piece keeps
 LEAST_WAY, LEAST_TURN = 0.03, 0.1  # least sums of squared commanded pieces [m²], [rad²]: smaller ones are noise
 ALIKE: Final = 4.0  # largest ratio of the sums of measured and commanded squares: noise, a push or a wall
-AGAINST_WAY, AGAINST_TURN = 0.0, -0.5  # correlations below which a robot moves against its commands
+AGAINST: Final = -0.3  # correlation below which a robot moves against its commands
 HALF_TURN: Final = 2.5  # [rad] faster turns of a piece have no certain sign
 
 
@@ -47,12 +48,13 @@ class MotionCheck:
 
     # more than CPython keeps beside an object: the tick would look each up in a dictionary
     __slots__ = (
-        "anchor", "anchor_yaw", "begin", "begin_yaw", "by_position", "by_twist", "commanded", "commanded_s",
-        "commanded_turn", "drift", "drifted", "due", "expected_turn", "expected_x", "expected_y", "flies", "follows",
-        "free", "last", "late_turn", "late_x", "late_y", "response", "rim", "samples", "slow", "speed", "turn",
-        "turn_before", "turned", "turned_asked", "turned_both", "turns_against", "unanswered", "unanswered_turn",
-        "uncommanded", "uncommanded_turn", "unresponsive", "way", "way_against", "way_asked", "way_before",
-        "way_both", "way_moved", "without", "x", "y", "z",
+        "anchor", "anchor_yaw", "before_turn", "before_x", "before_y", "begin", "begin_yaw", "by_position", "by_twist",
+        "commanded", "commanded_s", "commanded_turn", "drift", "drifted", "due", "expected_turn", "expected_x",
+        "expected_y", "flies", "follows", "free", "last", "late_turn", "late_x", "late_y", "response", "rim", "samples",
+        "slow", "speed", "turn", "turn_before", "turned", "turned_asked", "turned_asked_before", "turned_both",
+        "turned_both_before", "turns_against", "unanswered", "unanswered_turn", "uncommanded", "uncommanded_turn",
+        "unresponsive", "way", "way_against", "way_asked", "way_asked_before", "way_before", "way_both",
+        "way_both_before", "way_moved", "without", "x", "y", "z",
     )  # fmt: skip
 
     def __init__(self, kind: Kind, *, outside: bool = False) -> None:
@@ -96,9 +98,13 @@ class MotionCheck:
     def forget_sums(self) -> None:
         """Restart the correlation of commanded and measured motion."""
         self.way_against = self.turns_against = False  # it moves or turns against its commands
+        self.before_x = self.before_y = self.before_turn = 0.0  # expected in the piece before [m], [rad]
         # sums over pieces: products of both, squares of commanded and of measured ones [m²], [rad²]
         self.way_both = self.way_asked = self.way_moved = 0.0
         self.turned_both = self.turned_asked = self.turned = 0.0
+        # the same with what was commanded in the piece before
+        self.way_both_before = self.way_asked_before = 0.0
+        self.turned_both_before = self.turned_asked_before = 0.0
 
     def update(self, t: float, setpoint: Setpoint, position: Vector, yaw: float, watched: bool) -> None:
         """Add up the commanded motion, and compare at the end of each sample; call it on every tick, at `t` [s].
@@ -235,20 +241,26 @@ class MotionCheck:
 
     def correlate(self, x: float, y: float, turned: float) -> None:
         """Correlate the measured motion of a piece, x, y [m] and `turned` [rad], with the commanded one."""
-        ask_x, ask_y, ask = self.expected_x, self.expected_y, self.expected_turn
-        self.way_both = REMEMBERED * self.way_both + ask_x * x + ask_y * y
-        self.way_asked = REMEMBERED * self.way_asked + ask_x * ask_x + ask_y * ask_y
+        x_now, y_now, now = self.expected_x, self.expected_y, self.expected_turn
+        x_before, y_before, before = self.before_x, self.before_y, self.before_turn
+        self.before_x, self.before_y, self.before_turn = x_now, y_now, now
+        self.way_both = REMEMBERED * self.way_both + x_now * x + y_now * y
+        self.way_asked = REMEMBERED * self.way_asked + x_now * x_now + y_now * y_now
+        self.way_both_before = REMEMBERED * self.way_both_before + x_before * x + y_before * y
+        self.way_asked_before = REMEMBERED * self.way_asked_before + x_before * x_before + y_before * y_before
         self.way_moved = REMEMBERED * self.way_moved + x * x + y * y
-        asked, moved = self.way_asked, self.way_moved
-        judged = asked > LEAST_WAY and asked < ALIKE * moved and moved < ALIKE * asked
-        self.way_against = judged and self.way_both < AGAINST_WAY * sqrt(asked * moved)
-        if abs(ask) < HALF_TURN:
-            self.turned_both = REMEMBERED * self.turned_both + ask * turned
-            self.turned_asked = REMEMBERED * self.turned_asked + ask * ask
+        self.way_against = opposed(self.way_both, self.way_asked, self.way_moved, LEAST_WAY) and opposed(
+            self.way_both_before, self.way_asked_before, self.way_moved, LEAST_WAY
+        )
+        if abs(now) < HALF_TURN and abs(before) < HALF_TURN:
+            self.turned_both = REMEMBERED * self.turned_both + now * turned
+            self.turned_asked = REMEMBERED * self.turned_asked + now * now
+            self.turned_both_before = REMEMBERED * self.turned_both_before + before * turned
+            self.turned_asked_before = REMEMBERED * self.turned_asked_before + before * before
             self.turned = REMEMBERED * self.turned + turned * turned
-        asked, moved = self.turned_asked, self.turned
-        judged = asked > LEAST_TURN and asked < ALIKE * moved and moved < ALIKE * asked
-        self.turns_against = judged and self.turned_both < AGAINST_TURN * sqrt(asked * moved)
+        self.turns_against = opposed(self.turned_both, self.turned_asked, self.turned, LEAST_TURN) and opposed(
+            self.turned_both_before, self.turned_asked_before, self.turned, LEAST_TURN
+        )
 
     def words(self) -> str:
         """Extent of uncommanded motion, with its probable cause; rare."""
@@ -258,3 +270,9 @@ class MotionCheck:
             blown = ", or does a wind carry it" if self.flies else ""
             return f"{self.drifted:.2f} m lately, against its commands; are its axes swapped or mirrored{blown}?"
         return f"{self.drifted:.2f} m lately"
+
+
+def opposed(both: float, asked: float, moved: float, least: float) -> bool:
+    """Whether sums of products, of commanded and of measured squares show motion against the commands; not by noise."""
+    alike = asked > least and asked < ALIKE * moved and moved < ALIKE * asked
+    return alike and both < AGAINST * sqrt(asked * moved)

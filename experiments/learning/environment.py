@@ -216,7 +216,7 @@ class Environment(ParallelEnv):  # type: ignore[misc] # it has no types
     def step(
         self, actions: Mapping[str, Any]
     ) -> tuple[dict[str, Array], dict[str, float], dict[str, bool], dict[str, bool], Infos]:
-        """Fly until the next decision; raises LearningError where an action is missing, or not finite."""
+        """Fly until the next decision; raises LearningError for an action that is missing, it or a reward not finite."""
         self._acts.take(actions, self.agents)
         run, sent = self._run, list(self._run.network.seq)
         run.fly_ticks(self._every, everything=self._reward != self._link_error)
@@ -230,11 +230,18 @@ class Environment(ParallelEnv):  # type: ignore[misc] # it has no types
             ended[agent] = row in hurt or (lands and not over)
             count = run.network.seq[row] - sent[row]
             infos[agent] = {"messages": count, "seed": self.seed}
-            rewards[agent] = self._reward(snapshot, row) - self._price * count - self._penalty * ended[agent]
+            rewards[agent] = self._given(agent, snapshot, row) - self._price * count - self._penalty * ended[agent]
         truncated = {agent: over and not ended[agent] for agent in self.agents}
         observations = self._observations()
         self.agents = [agent for agent in self.agents if not (over or ended[agent])]
         return observations, rewards, ended, truncated, infos
+
+    def _given(self, agent: str, snapshot: Snapshot, row: int) -> float:
+        """The reward of an agent, checked."""
+        given = self._reward(snapshot, row)
+        if not (isinstance(given, int | float | np.number) and math.isfinite(given)):
+            raise LearningError(f"{agent}: the reward at {snapshot.time:.2f} s is {given!r}; return a finite number")
+        return float(given)
 
     def view(self, agent: str) -> View:
         """View of an agent, as its law would get it now; once between two steps."""

@@ -12,12 +12,13 @@ from bridges.crazyflie.protocol.tables import READ_ONLY, inventory
 
 TIMES: Final = 4.0  # largest ratio of a value and the firmware's own, either way
 CHOICES: Final = {"stabilizer.controller": (0, 7)}  # first and last number of what is a choice
-PROTECTIONS: Final = ("supervisor.", "pm.")  # tumble check, crash detection, timeouts, voltages
-# motors by hand, tests that turn propellers, resets, and what zenpark sets from other settings
+# tumble check, crash detection, timeouts, voltages; speeds by the Flow deck
+PROTECTIONS: Final = ("supervisor.", "pm.", "motion.disable")
+# motors by hand, tests that turn propellers, modes of pilots, resets, and what zenpark sets from other settings
 TAKEN: Final = (
-    "motorPowerSet.", "health.", "system.", "powerDist.", "stabilizer.stop", "stabilizer.estimator",
+    "motorPowerSet.", "health.", "system.", "powerDist.", "stabilizer.stop", "stabilizer.estimator", "flightmode.",
     "commander.enHighLevel", "hlCommander.groupmask", "kalman.resetEstimation", "kalman.initial", "locSrv.",
-    "lighthouse.", "loco.",
+    "lighthouse.", "loco.", "memTst.", "ukf.resetEstimation", "usec.reset",
 )  # fmt: skip
 
 
@@ -46,6 +47,9 @@ def parameter_faults(chosen: Mapping[str, float], unprotected: Collection[str] =
             message = f"{name} is none of the {len(known)} parameters of the firmware that are known here"
             hint = did_you_mean(name, known) or "without it on board the drone is not ready"
             yield ParameterFault(name, message, hint, "warning")
+        elif (whole := whole_numbers(known[name].type)) is not None and value not in whole:
+            message = f"{name} = {value:g} cannot be held on board"
+            yield ParameterFault(name, message, f"choose a whole number from {whole[0]} to {whole[-1]}")
         elif name in CHOICES:
             low, high = CHOICES[name]
             if value not in range(low, high + 1):
@@ -55,3 +59,11 @@ def parameter_faults(chosen: Mapping[str, float], unprotected: Collection[str] =
             yield ParameterFault(name, message, f"choose {default / TIMES:g} to {default * TIMES:g}")
         elif not isfinite(value) or value < 0.0:
             yield ParameterFault(name, f"{name} = {value:g} is no gain", "choose a value from 0 on")
+
+
+def whole_numbers(kind: str) -> range | None:
+    """Numbers that a type of whole numbers holds; None for others."""
+    if kind[0] not in "ui":
+        return None
+    bits = int(kind[1:])
+    return range(2**bits) if kind[0] == "u" else range(-(2 ** (bits - 1)), 2 ** (bits - 1))

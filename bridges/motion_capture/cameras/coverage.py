@@ -19,6 +19,7 @@ FOUND_PX: Final = 14.0  # shortest side of a tag of which 98 % are found by boxe
 STEPS: Final = 13  # places along x and y
 HEIGHTS: Final = 6  # heights of drones
 SIZES: Final = (0.04, 0.05, 0.06, 0.08, 0.1, 0.12, 0.15, 0.2)  # tags that are proposed [m]
+SHORTEST_M, LONGEST_M = 0.1, 100.0  # sides of a room
 ENOUGH: Final = 0.99  # share of the places that is good enough
 
 
@@ -41,6 +42,8 @@ def models(lab: CamerasFile) -> list[CameraModel]:
         if name in lab.measured:
             found.append(CameraModel(lab.measured[name]))
         elif camera.planned is not None:
+            if camera.planned.aim == camera.planned.place:
+                raise CamerasFileError(f"{name}.planned: aim is its place; write a point in the middle of its image")
             found.append(CameraModel(hung(camera.planned)))
         else:
             example = "{ place = [-1.7, -1.7, 2.6], aim = [0.0, 0.0, 0.3], view_deg = 78.0 }"
@@ -77,7 +80,10 @@ def _least(found: Mapping[float, Array]) -> float:
 
 
 def report(path: Path, room: tuple[float, float, float]) -> Iterator[str]:
-    """Lines about each kind of tag of a file; raises CamerasFileError."""
+    """Lines about each kind of tag of a file, in a room of three sides [m]; raises CamerasFileError."""
+    if not all(SHORTEST_M <= side <= LONGEST_M for side in room):
+        given = " ".join(f"{side:g}" for side in room)
+        raise CamerasFileError(f"--room {given}: write three sides of {SHORTEST_M:g} to {LONGEST_M:g} m")
     lab = file.read(path)
     cameras, kinds = models(lab), set[tuple[float, float, bool]]()
     for name, body in lab.bodies.items():

@@ -18,6 +18,7 @@ MARK: Final = "# ---- measured by ./zenpark cameras calibrate: everything below 
 
 Length = Annotated[float, Meta(gt=0, le=10)]
 Number = Annotated[float, Meta(ge=-1e6, le=1e6)]
+Pixels = Annotated[int, Meta(ge=16, le=20000)]
 TagNumber = Annotated[int, Meta(ge=0, le=HIGHEST_TAG)]
 Triple = tuple[Number, Number, Number]
 
@@ -31,7 +32,7 @@ class PlannedCamera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     place: Triple  # position in the arena [m]
     aim: Triple  # point in the middle of its image [m]
-    size: tuple[int, int] = (1280, 720)  # width and height of its images [px]
+    size: tuple[Pixels, Pixels] = (1280, 720)  # width and height of its images [px]
     view_deg: Annotated[float, Meta(gt=0, le=150)] = 78.0  # horizontal field of view [degrees]
 
 

@@ -114,13 +114,19 @@ def test_slow_motion_against_commands_is_found(kind):
 
 
 @every_kind
-def test_late_motion_is_not_against_commands(kind):
-    """Commands to and fro in a second or more, that take effect 0.3 s later."""
-    robot, late = Told(kind), [0.0] * 30
-    for tick in range(6000):
-        late.append(math.sin(2.0 * math.pi * DT * tick / 4.0))
-        now, then = 0.2 * kind.speed * late[-1], 0.2 * kind.speed * late[-31]
-        assert robot.go(DT, told=now, speed=then, told_turn=late[-1], turn=late[-31]) == FINE
+@pytest.mark.parametrize("shape", [lambda sine: sine, lambda sine: math.copysign(1.0, sine)], ids=["sine", "square"])
+def test_late_motion_is_not_against_commands(kind, shape):
+    """Commands to and fro in a second or more; a right robot that had motion of half a period late was landed."""
+    for period_s in (1.0, 1.2, 1.5, 2.0, 4.0):
+        for late in (15, 30, 45, 60):
+            robot, given = Told(kind), [0.0] * late
+            for tick in range(1500):
+                given.append(shape(math.sin(2.0 * math.pi * DT * tick / period_s)))
+                now, then = given[-1], given[-1 - late]
+                way, turn = 0.4 * kind.speed, 0.8
+                robot.go(DT, told=way * now, speed=way * then, told_turn=turn * now, turn=turn * then)
+                assert not robot.motion_check.way_against, (period_s, late)
+                assert not robot.motion_check.turns_against, (period_s, late)
 
 
 @every_kind

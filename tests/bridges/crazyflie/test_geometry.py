@@ -95,6 +95,11 @@ def faults(positioning=None, host="", **device):
         ("posCtlPid.xKi", math.nan, "error: posCtlPid.xKi = nan is no gain"),
         ("stabilizer.controller", 2.0, ""),
         ("stabilizer.controller", 9.0, "error: stabilizer.controller = 9 is no choice"),
+        ("posCtlPid.thrustBase", 40000.0, ""),
+        ("posCtlPid.thrustBase", 140000.0, "error: posCtlPid.thrustBase = 140000 cannot be held on board"),
+        ("posCtlPid.thrustBase", 36000.5, "error: posCtlPid.thrustBase = 36000.5 cannot be held on board"),
+        ("motion.disable", 1.0, "error: motion.disable is a protection of the drone"),
+        ("flightmode.posSet", 1.0, "error: flightmode.posSet: not for a file"),
         ("supervisor.tmblChckEn", 0.0, "error: supervisor.tmblChckEn is a protection of the drone"),
         ("motorPowerSet.enable", 1.0, "error: motorPowerSet.enable: not for a file, as it turns motors"),
         ("deck.bcLoco", 1.0, "error: deck.bcLoco: not for a file"),
@@ -105,7 +110,7 @@ def test_parameters_are_bounded(name, value, said):
     found = [f"{severity}: {message}" for severity, _, _, message in faults(parameters={name: value})]
     assert [each[: len(said)] for each in found] == [said] * bool(said)
     allowed = faults(parameters={name: value}, unprotected=[name])
-    assert allowed == [] or not name.startswith("supervisor")
+    assert allowed == [] or not name.startswith(("supervisor", "motion"))
 
 
 def test_file_faults_find_geometry_where_it_lies(saved):

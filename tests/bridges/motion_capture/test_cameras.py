@@ -275,6 +275,12 @@ def test_coverage_is_told_before_cameras_hang(tmp_path):
     assert "  a tag of 0.12 m is seen everywhere, or this one in images 1.2 times as wide" in told
     assert told[-1] == "  no larger tag is seen everywhere: more cameras, or hang and turn them otherwise"
     assert told[-3] == "    " + " ".join(["."] * coverage.STEPS), "a drone needs two"
+    for room in ((0.0, 3.0, 1.0), (3.0, -3.0, 1.0), (3.0, 3.0, np.nan)):
+        with pytest.raises(file.CamerasFileError, match=r"--room .*: write three sides of 0\.1 to 100 m"):
+            list(coverage.report(path, room))
+    path.write_text(path.read_text().replace("aim = [0.0, 0.0, 0.3]", "aim = [-1.7, -1.7, 2.6]"))
+    with pytest.raises(file.CamerasFileError, match=r"A\.planned: aim is its place"):
+        list(coverage.report(path, (2.0, 2.0, 1.0)))
 
 
 def test_tags_are_seen_where_coverage_says():

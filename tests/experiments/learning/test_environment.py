@@ -227,6 +227,14 @@ def test_states_go_on_to_the_last_bit():
     assert made.reset()[1]["CF01"]["seed"] == 4  # in turn with 3
 
 
+@pytest.mark.parametrize("given", [None, "good", math.nan, np.ones(3)])
+def test_a_reward_is_a_finite_number(given):
+    made = Environment(load("triangle", duration_s=9.0), reward=lambda *_: given)
+    made.reset(1)
+    with pytest.raises(LearningError, match=r"KH01: the reward at 0\.\d* s is .*; return a finite number"):
+        made.step({name: np.zeros(2, dtype=np.float32) for name in made.agents})
+
+
 def test_robots_that_touch_end_early():
     made = Environment(load("triangle", duration_s=9.0), penalty=7.0, message_price=0.5, reward=lambda *_: 1.0)
     made.reset()
