@@ -216,7 +216,7 @@ class Environment(ParallelEnv):  # type: ignore[misc] # it has no types
     def step(
         self, actions: Mapping[str, Any]
     ) -> tuple[dict[str, Array], dict[str, float], dict[str, bool], dict[str, bool], Infos]:
-        """Fly until the next decision; raises LearningError for an action that is missing, it or a reward not finite."""
+        """Fly until the next decision; raises LearningError where an action is missing, or a number is not finite."""
         self._acts.take(actions, self.agents)
         run, sent = self._run, list(self._run.network.seq)
         run.fly_ticks(self._every, everything=self._reward != self._link_error)
