@@ -37,9 +37,9 @@ STALL_S: Final = 0.2  # wait for a reader of progress that stands still
 class _Lasting:
     """Stream that drops what cannot be written: its reader has gone, or its disk is full."""
 
-    def __init__(self, stream: TextIO, *, lasts: bool) -> None:
-        """`lasts`: for a reader that stands still, however long; else what comes meanwhile is dropped."""
-        self._stream, self._lasts = stream, lasts
+    def __init__(self, stream: TextIO, *, patient: bool) -> None:
+        """`patient`: a reader that stands still is waited for, however long; else what comes meanwhile is dropped."""
+        self._stream, self._patient = stream, patient
 
     def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - whatever the stream has
         return getattr(self._stream, name)
@@ -47,7 +47,7 @@ class _Lasting:
     def write(self, text: str) -> int:
         """Write a text, or drop it."""
         with self._dropping():
-            if self._lasts or self._is_read():
+            if self._patient or self._is_read():
                 self._stream.write(text)
         return len(text)
 
@@ -78,6 +78,6 @@ class _Lasting:
 def lasting_console() -> Iterator[None]:
     """Inside, whatever is printed cannot end the process, and no progress stops it: robots fly on without a console."""
     with ExitStack() as both:
-        both.enter_context(redirect_stdout(cast(TextIO, _Lasting(sys.stdout, lasts=True))))
-        both.enter_context(redirect_stderr(cast(TextIO, _Lasting(sys.stderr, lasts=False))))
+        both.enter_context(redirect_stdout(cast(TextIO, _Lasting(sys.stdout, patient=True))))
+        both.enter_context(redirect_stderr(cast(TextIO, _Lasting(sys.stderr, patient=False))))
         yield

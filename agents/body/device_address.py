@@ -13,7 +13,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from itertools import product
+from itertools import chain, product
 from typing import Final
 from urllib.parse import urlsplit
 
@@ -44,17 +44,14 @@ class DeviceAddress:
 
         `hosts` are the addresses of each host, see `resolved`; left out: no name server is asked.
         """
-        named = {each: self._addresses(each, hosts) for each in self.hosts}
-        places = sorted({place for addresses in named.values() for place in addresses}) or [""]
+        resolved_to = [(hosts or {}).get(host, ()) for host in self.hosts]
+        places = sorted({*map(canonical, self.hosts), *chain(*resolved_to)}) or [""]
         written = [("", part) if part else ("",) for part in self.parts]
         for place in places:
             for chosen in product(*written):
                 if not (place or any(chosen)):  # all devices without a host have nothing in common
                     continue
                 yield " ".join((place, *chosen)), chosen == self.parts
-
-    def _addresses(self, host: str, hosts: Mapping[str, Iterable[str]] | None) -> set[str]:
-        return {canonical(host), *(hosts or {}).get(host, ())}
 
 
 def plain_device(address: str) -> DeviceAddress | None:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final
 
 from agents.body.device_address import DeviceAddress, resolved
-from agents.body.interface import BodyEntry, BodyError, BodyRequest
+from agents.body.interface import BodyError, BodyRequest
 from agents.plugins import registry
 from agents.user_folder import foreign_folders, runtime_folders
 
@@ -38,9 +38,7 @@ class Claims:
     def of(cls, request: BodyRequest) -> Claims:
         """Devices of all rows of a request, by the classes of their bodies; raises BodyError for wrong addresses."""
         devices = []
-        rows = zip(request.names, request.kinds, request.addresses, request.device, request.external, strict=True)
-        for row in rows:
-            robot = BodyEntry(*row, process=request.names[0])
+        for robot in request.entries():
             body = registry.load(registry.BODIES, registry.body_name(robot.address))
             if (device := body.device_of(robot, request.endpoints)) is not None:
                 devices.append((robot.name, device))

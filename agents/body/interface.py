@@ -84,6 +84,11 @@ class BodyRequest:
         columns: dict[str, Any] = {name: tuple(getattr(self, name)[row] for row in rows) for name in per_row}
         return replace(self, **columns)
 
+    def entries(self) -> list[BodyEntry]:
+        """Robots of the rows, as the classes of their bodies judge them."""
+        rows = zip(self.names, self.kinds, self.addresses, self.device, self.external, strict=True)
+        return [BodyEntry(*row, process=self.names[0]) for row in rows]
+
 
 @dataclass(frozen=True)
 class BodyEntry:
@@ -273,8 +278,7 @@ def judged(robot: BodyEntry, key: tuple[str | int, ...], parse: Callable[[], obj
 
 def refuse(body: type[Body], request: BodyRequest) -> None:
     """Raises BodyError for errors of the rows of a body, before it is made."""
-    rows = zip(request.names, request.kinds, request.addresses, request.device, request.external, strict=True)
-    entries = [BodyEntry(*row, process=request.names[0]) for row in rows]
+    entries = request.entries()
     faults = [*body.faults(entries), *shared_devices((each, body) for each in entries)]
     if errors := [str(fault) for fault in faults if fault.severity == "error"]:
         raise BodyError("; ".join(errors))

@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Final, NoReturn
 
 import zenoh
@@ -54,8 +54,9 @@ def end(code: int) -> NoReturn:
     still closing, the process would end by SIGABRT ("FATAL: exception not rethrown").
     """
     if any(thread.daemon for thread in threading.enumerate()):
-        sys.stdout.flush()
-        sys.stderr.flush()
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(OSError):  # its reader has gone, or its disk is full
+                stream.flush()
         os._exit(code)
     sys.exit(code)
 

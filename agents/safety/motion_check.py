@@ -7,8 +7,8 @@ measured positions nor their resolution matters.
 
 A turn of the wrong sign, or swapped wheels, need not lead far away. They show in the correlation of commanded and
 measured motion, however slow. Commands that take effect late let a right body move against those of the moment, if they
-alternate: only who moves against those of the piece before as well is wrong. A wind carries drones against slow
-commands, so that the way of those is judged by its length alone.
+alternate: only a body that moves against those of the piece before as well is wrong. A wind carries drones against
+slow commands, so that their way is judged by its length alone.
 
 Quiet: all but `words`.
 """
@@ -216,7 +216,8 @@ class MotionCheck:
             self.drift, self.uncommanded_turn = ZERO, 0.0
             self.forget_sums()
         else:
-            self.correlate(moved[0], moved[1], wrap(yaw - self.begin_yaw))
+            turned = wrap(yaw - self.begin_yaw)
+            self.correlate(moved[0], moved[1], turned)
             drift = self.drift
             self.drift = (
                 KEPT * drift[0] + moved[0] - obeyed * toward[0],
@@ -224,7 +225,7 @@ class MotionCheck:
                 KEPT * drift[2] + moved[2] - obeyed * toward[2],
             )
             if self.by_twist:
-                turned, commanded = wrap(yaw - self.begin_yaw), self.turn + self.turn_before
+                commanded = self.turn + self.turn_before
                 stray = turned - clamp(turned, min(commanded, 0.0), max(commanded, 0.0))
                 self.uncommanded_turn = KEPT * self.uncommanded_turn + stray
         self.drifted = norm(self.drift)

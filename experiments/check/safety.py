@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 
 from agents.body.kinds import KINDS
+from agents.network.keys import Keys
 from agents.plugins import registry
 from agents.safety.setpoint_filter import OUTSIDE_M
 from experiments.check.analysis import Analysis
@@ -137,8 +138,8 @@ def positioning(analysis: Analysis) -> Iterator[Finding]:
         message = f'no robot has position = "external", so nothing is asked of {experiment.capture.source}'
         yield Finding("warning", "position-unused", message, "add it to each robot that is measured", ("positioning",))
     elif experiment.capture is None and measured:
-        source = f"park/{measured[0]}/position".replace("park", experiment.network.realm, 1)
-        message = f"{join_names(measured)}: positions from outside, by a program that publishes {source}"
+        key = Keys(experiment.network.realm).position(measured[0])
+        message = f"{join_names(measured)}: positions from outside, by a program that publishes {key}"
         remedy = 'or name a system: positioning = "optitrack://HOST"'
         yield Finding("note", "position-published", message, remedy, ("robots", measured[0], "position"))
 

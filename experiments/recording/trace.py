@@ -178,7 +178,7 @@ class Trace:
 
     @cached_property
     def link_errors(self) -> Array:
-        """Errors (T, E) [m] of links on true positions, see `formation.errors_over_time`; blind of blind robots."""
+        """Errors (T, E) [m] of links on true positions, see `formation.errors_over_time`; NaN of blind robots."""
         blind, place = self.blind, self.true_position
         place = np.where(blind[:, :, None], np.nan, place) if blind.any() else place
         return errors_over_time(self.plan.law, self.plan.formation, self.time, place)

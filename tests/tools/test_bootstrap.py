@@ -218,7 +218,7 @@ def test_python_in_a_path_with_blanks_is_found(bootstrap, monkeypatch):
 
 @pytest.fixture
 def started_modules(bootstrap, monkeypatch):
-    """The modules that `./zenpark test` starts; tests fail in the foreground, and mypy if `wrong` is not empty."""
+    """The modules that `./zenpark test` starts; tests fail in the foreground; mypy ends with the codes in `wrong`."""
     modules, wrong = [], []
 
     def begin(module):
@@ -227,7 +227,7 @@ def started_modules(bootstrap, monkeypatch):
 
     def python(module, **_):
         modules.append(module)
-        return -9 if module[0] == "pytest" else int(module[0] == "mypy" and bool(wrong))
+        return -9 if module[0] == "pytest" else sum(wrong) if module[0] == "mypy" else 0
 
     monkeypatch.setattr(bootstrap, "add_needed", lambda: None)
     monkeypatch.setattr(bootstrap, "begin", begin)
@@ -254,5 +254,7 @@ def test_tests_run_in_two_parts_or_as_given(bootstrap, started_modules):
     ]
     names = [module[0] for module in started("--all")]
     assert names == ["pytest", "tests.fuzz", "tests.system.zenohd", "tests.system.rclpy_wheels", "pytest"]
-    wrong.append("a type")
+    wrong.append(1)
     assert [started(*words, code=1)[1:] for words in ((), ["--quick"], ["tests/agents"])] == [[], [], []]
+    wrong[:] = [-9]
+    assert started() == [processes], "mypy was killed"

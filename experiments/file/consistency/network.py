@@ -156,7 +156,7 @@ def channel_faults(plan: Plan) -> Iterator[Fault]:
 def _link(
     experiment: Experiment, linked: set[tuple[str, str]] | None, text: str, path: Path, *, on_key: bool = False
 ) -> Iterator[Fault]:
-    """Faults of a text that names a link on which poses are sent; `there` are all of those, if known."""
+    """Faults of a text that names a link on which poses are sent; `linked` are all of those, if known."""
     both = pairs_or_none(text)
     if not both:
         yield Fault(path, f"{text!r} is no link", FORM, on_key=on_key)

@@ -117,7 +117,7 @@ def days_left(folder: Path, names: Sequence[str]) -> float:
 
 
 def faults(found: FolderContent, folder: Path, host_utc: float) -> Iterator[str]:
-    """Faults of the certificates of a machine with its clock at `there` [s, UTC], each with its remedy.
+    """Faults of the certificates of a machine with its clock at `host_utc` [s, UTC], each with its remedy.
 
     `folder` is that of the lab on this machine, with its register and `ca.pem`.
     """

@@ -210,10 +210,10 @@ class States:
             [mirror.velocity for mirror in mirrors],
         )
 
-    def restore(self, stands: Set[str]) -> dict[str, bool]:
-        """Places simulated robots that are `there` at the poses of their states: their names, and whether they fly."""
+    def restore(self, alive: Set[str]) -> dict[str, bool]:
+        """Places simulated robots that are `alive` at the poses of their states: their names, and whether they fly."""
         carried = zip(self._names, self._population.carried, strict=True)
-        waiting = {name: self._states_of(name) for name, here in carried if here and name in stands}
+        waiting = {name: self._states_of(name) for name, here in carried if here and name in alive}
         found: dict[str, bool] = {}
         deadline, pause = time.monotonic() + ANSWER_S, threading.Event()
         while waiting and time.monotonic() < deadline:

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -10,6 +11,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import repeat
 from typing import Any
+from unittest.mock import Mock
 
 import psutil
 import pytest
@@ -278,6 +280,7 @@ def test_frozen_process_is_no_hanging_loop():
 def test_no_daemon_thread_outlives_the_interpreter(monkeypatch, daemon, at_once):
     """Inside Zenoh it would take the process along, by SIGABRT."""
     ended = []
+    monkeypatch.setattr(sys, "stdout", Mock(flush=Mock(side_effect=BrokenPipeError)))
     monkeypatch.setattr(os, "_exit", ended.append)
     monkeypatch.setattr(threading, "enumerate", lambda: [threading.main_thread(), threading.Thread(daemon=daemon)])
     with pytest.raises(SystemExit, match="4"):
