@@ -165,7 +165,7 @@ class Stretches:
     refusal: str  # why nothing can be compiled, empty as long as it can
     called_back: str = ""  # likewise for steps of laws, and changes of the formation
     tick: int  # tick of the present stretch of which the first half is done
-    end: int  # limit of that
+    end: int  # last tick of the present stretch
 
     def __init__(self, flight: Flown) -> None:
         self._flight, self._case = flight, msgspec.json.encode(flight.plan.experiment)
@@ -207,12 +207,12 @@ class Stretches:
             return False
         ticks = end - k
         rates = flight.plan.experiment.rates
-        questions = ticks // round(rates.body_hz / rates.pose_hz) + ROOM
+        transmissions = ticks // round(rates.body_hz / rates.pose_hz) + ROOM
         samples = ticks // flight.log_every + ROOM
-        self._ledger = ledger = Ledger(self._members, questions, samples, start=flight.start_at, lean=flight.lean)
+        self._ledger = ledger = Ledger(self._members, transmissions, samples, start=flight.start_at, lean=flight.lean)
         if not flight.lean:
             for way in self._ways:
-                way.arrivals = array("d", (0.0,)) * questions
+                way.arrivals = array("d", (0.0,)) * transmissions
         for member in self._members:
             member.seq = flight.network.seq[member.row]
             member.twin.reserve(ticks)
