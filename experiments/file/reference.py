@@ -16,7 +16,10 @@ from typing import Any, Final
 import msgspec
 
 from agents.body.kinds import KINDS, Kind
+from agents.plugins.registry import split
 from experiments.catalogue.index import FOLDER
+from experiments.definition.experiment import Experiment
+from experiments.file.choices import fields_of, group_of, struct_of
 from experiments.file.json_schema import CASE, described, map_children
 
 NONE: Final[Mapping[str, object]] = {}
@@ -88,12 +91,27 @@ def matching(asked: str) -> list[Entry]:
     return found + [each for each in entries() if each.key.startswith(tables) and each not in found]
 
 
-def unit(asked: str) -> str:
-    """Unit of a key as a user writes it, without its case; empty if it has none, or plug-ins differ in it."""
+def unit(asked: str, experiment: Experiment) -> str:
+    """Unit of a key as a user writes it; empty if it has none. A parameter has that of the plug-in in `experiment`."""
     path = re.sub(r"^cases\.[^.]+\.", "", asked)
-    found = [re.search(r"\[([^\]\s]+)\]", entry.text) for entry in matching(path)]
+    steps = [int(step) if step.isdigit() else step for step in path.split(".")]
+    if (group := group_of(tuple(steps[:-1]))) is None:
+        texts = [entry.text for entry in matching(path)]
+    else:
+        choice: Any = experiment
+        for step in steps[:-1]:
+            choice = getattr(choice, str(step)) if isinstance(choice, msgspec.Struct) else choice[step]
+        texts = [_description(struct_of(group, split(choice)[0]), str(steps[-1]))]
+    found = [re.search(r"\[([^\]\s]+)\]", text) for text in texts]
     units = {each[1] if each else "" for each in found}
     return units.pop() if len(units) == 1 else ""
+
+
+def _description(struct: type[msgspec.Struct], key: str) -> str:
+    """Text of a field; empty without one."""
+    known = fields_of(struct).get(key)
+    metas = getattr(known.type, "__metadata__", ()) if known else ()
+    return next((each.description for each in metas if isinstance(each, msgspec.Meta) and each.description), "")
 
 
 def containing(asked: str) -> list[Entry]:

@@ -78,13 +78,15 @@ def row(
         for seed in sorted(runs)
         if seed in reference and equally_long((runs[seed].duration_s, reference[seed].duration_s))
     ]
+    experiment = cell.plan.experiment
+    units = {path: reference_of_file.unit(path, experiment) for path in cell.parameters}
     acquired = [run.values["acquired_s"] is not None for run in ordered]
     gaps = [run.gap_min_s for run in ordered if run.gap_min_s is not None]
     return CellRow(
         case=cell.case,
         parameters=dict(cell.parameters),
         environment=dict(cell.environment),
-        units={path: unit for path in cell.parameters if 0 < len(unit := reference_of_file.unit(path)) <= SHORT},
+        units={path: unit for path, unit in units.items() if 0 < len(unit) <= SHORT},
         reference=cell.digest == cell.reference,
         seeds=len(ordered),
         failed=failed,

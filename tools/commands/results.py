@@ -70,7 +70,7 @@ def report(
     if metrics and form is None:
         raise refusal("--metrics", "chooses numbers of a printed table", "add --latex or --markdown")
     if pdf and form is not None:
-        raise refusal("--pdf", "writes figures", "leave out --latex or --markdown")
+        raise refusal("--pdf", "writes figures, not the table", "give --latex or --markdown in a command of its own")
     if len(runs) == 1 and (Path(runs[0]) / SWEEP).is_file():
         return _report_sweep(Path(runs[0]), out, width, metrics, form, pdf=pdf, as_json=as_json)
     folders = _folders_of_runs(runs)

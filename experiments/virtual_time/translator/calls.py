@@ -199,6 +199,8 @@ class Calls(Expressions):
         if node.keywords or not given or (len(given) > 1 and not several):
             raise self.error(node, "round to digits" if name == "round" else f"a call of {called} with other arguments")
         first = given[0]
+        if found is float and first.constant in ("nan", "inf"):
+            return constant(float(first.constant))
         if of_math and MATH[name] == first.type == WHOLE:
             return first
         if of_math:

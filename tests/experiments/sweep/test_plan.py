@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from experiments.file import reference
+from experiments.file import document, reference
 from experiments.file.document import load
 from experiments.file.problems import DocumentError
 from experiments.metrics.metric import swept_metrics
@@ -17,6 +17,18 @@ from experiments.sweep.pareto import by_environment, front
 from experiments.sweep.plan import Span, arguments, cells, seeds_of
 from experiments.sweep.table import CellRow, relative_metrics
 from tools.commands import sweep as commands
+
+HEAVY = """
+from typing import Annotated
+import msgspec
+from zenpark import Law
+
+class Heavy(Law):
+    gain: float = 1.0
+    inertia: Annotated[float, msgspec.Meta(description="m [kg]")] = 1.0
+
+    def step(self, view, memory): ...
+"""
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +81,17 @@ def test_loss_is_environment_and_threshold_is_chosen(triangle_document):
     plan = planned(triangle_document, "trigger.threshold=0.005,0.02", "channel.loss=0,0.1", delay)
     met = {frozenset(cell.environment) for cell in plan if cell.case == "event"}
     assert met == {frozenset(("channel.loss", "cases.event.channel.delay_s"))}
-    assert {reference.unit(f"{case}trigger.threshold") for case in ("", "cases.event.")} == {"m"}
+
+
+def test_a_parameter_has_the_unit_of_its_plug_in(tmp_path, triangle_document):
+    event = triangle_document.cases()["event"].experiment
+    assert [reference.unit(f"{case}trigger.threshold", event) for case in ("", "cases.event.")] == ["m", "m"]
+    assert [reference.unit(path, event) for path in ("channel.delay_s", "channel.loss")] == ["s", ""]
+    (tmp_path / "heavy.py").write_text(HEAVY)
+    (tmp_path / "triangle.toml").write_bytes(triangle_document.path.read_bytes())
+    law = 'formation.law={ kind = "heavy.py:Heavy", gain = 1.0, inertia = 2.0 }'
+    heavy = document.read(tmp_path / "triangle.toml", [law]).cases()["event"].experiment
+    assert [reference.unit(f"formation.law.{key}", heavy) for key in ("gain", "inertia")] == ["", "kg"]
 
 
 def test_trigger_of_the_reference_stays_as_written(triangle_document):

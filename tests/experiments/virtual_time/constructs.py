@@ -251,9 +251,10 @@ def whole_parts(x, y, i):
 
 
 def of_python(x, y, i, j):
-    """`min` and `max` of numbers of one type, `abs`, `len`, `float`, `bool`"""
+    """`min` and `max` of numbers of one type, `abs`, `len`, `float`, `bool`; `float("nan")`, `float("inf")`"""
     least = min(x, y), max(x, y), min(i, j), max(i, j), min((x, y, 0.0)), max(x, 0.0), min(max(x, -1.0), 1.0)
-    return least, abs(x), abs(i), len((x, y)), float(i), float(x < y), bool(i), min(nan, x), max(x, nan)
+    unknown = float("nan"), -float("inf")
+    return least, abs(x), abs(i), len((x, y)), float(i), float(x < y), bool(i), min(nan, x), max(x, nan), unknown
 
 
 def words(x, i, j):
