@@ -83,7 +83,7 @@ def test_loss_is_environment_and_threshold_is_chosen(triangle_document):
     assert met == {frozenset(("channel.loss", "cases.event.channel.delay_s"))}
 
 
-def test_a_parameter_has_the_unit_of_its_plug_in(tmp_path, triangle_document):
+def test_parameter_has_the_unit_of_its_plugin(tmp_path, triangle_document):
     event = triangle_document.cases()["event"].experiment
     assert [reference.unit(f"{case}trigger.threshold", event) for case in ("", "cases.event.")] == ["m", "m"]
     assert [reference.unit(path, event) for path in ("channel.delay_s", "channel.loss")] == ["s", ""]
