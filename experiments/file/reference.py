@@ -103,7 +103,7 @@ def unit(asked: str, experiment: Experiment) -> str:
             choice = getattr(choice, str(step)) if isinstance(choice, msgspec.Struct) else choice[step]
         texts = [_description(struct_of(group, split(choice)[0]), str(steps[-1]))]
     found = [re.search(r"\[([^\]\s]+)\]", text) for text in texts]
-    units = {each[1] if each else "" for each in found}
+    units = {each[1] if each and each[1] != "1" else "" for each in found}
     return units.pop() if len(units) == 1 else ""
 
 

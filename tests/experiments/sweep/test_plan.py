@@ -2,6 +2,7 @@
 
 from itertools import pairwise
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -87,6 +88,8 @@ def test_parameter_has_the_unit_of_its_plugin(tmp_path, triangle_document):
     event = triangle_document.cases()["event"].experiment
     assert [reference.unit(f"{case}trigger.threshold", event) for case in ("", "cases.event.")] == ["m", "m"]
     assert [reference.unit(path, event) for path in ("channel.delay_s", "channel.loss")] == ["s", ""]
+    relative = msgspec.structs.replace(event, trigger={"kind": "relative", "share": 0.1})
+    assert reference.unit("trigger.share", relative) == ""
     (tmp_path / "heavy.py").write_text(HEAVY)
     (tmp_path / "triangle.toml").write_bytes(triangle_document.path.read_bytes())
     law = 'formation.law={ kind = "heavy.py:Heavy", gain = 1.0, inertia = 2.0 }'
