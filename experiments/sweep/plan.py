@@ -258,7 +258,8 @@ def _parsed(axis: Axis, value: str, read: Document) -> Override:
 
 
 def _has(case: str, plan: Plan, parsed: Override) -> bool:
-    """Whether a case has what is changed: a parameter of a plug-in if it has chosen that plug-in."""
+    """Whether a case has what is changed: a parameter of a plug-in if it has chosen that plug-in, and no `--set` of the
+    case has the last word."""
     path = parsed.path
     if parsed.case not in (None, case):
         return False
@@ -271,7 +272,9 @@ def _has(case: str, plan: Plan, parsed: Override) -> bool:
                     if isinstance(choice, msgspec.Struct) and isinstance(step, str)
                     else choice[step]
                 )
-            return path[end] == "kind" or (isinstance(choice, dict) and path[end] in choice)
+            if path[end] == "kind" or not isinstance(choice, dict) or path[end] not in choice:
+                return path[end] == "kind"
+            return len(path) > end + 1 or bool(choice[path[end]] == parsed.value)
     return True
 
 

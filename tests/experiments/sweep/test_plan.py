@@ -84,6 +84,12 @@ def test_loss_is_environment_and_threshold_is_chosen(triangle_document):
     assert met == {frozenset(("channel.loss", "cases.event.channel.delay_s"))}
 
 
+def test_set_of_a_case_is_not_swept():
+    fixed = 'cases.event.trigger={ kind = "send-on-delta", threshold = 0.03 }'
+    plan = planned(load("triangle", fixed), "trigger.threshold=0.01,0.02", cases=["event"], settings=[fixed])
+    assert [dict(cell.parameters) for cell in plan] == [{}, {}]
+
+
 def test_parameter_has_the_unit_of_its_plugin(tmp_path, triangle_document):
     event = triangle_document.cases()["event"].experiment
     assert [reference.unit(f"{case}trigger.threshold", event) for case in ("", "cases.event.")] == ["m", "m"]
