@@ -10,7 +10,7 @@ from tests.simulated import campaign, laboratory
 from tests.simulated.faults import Fault
 from tests.simulated.laboratory import ROOT
 
-FIRST, PARTS, EACH = 1, 25, 4  # seeds of every test run, in parts that workers share: a minute of a core
+FIRST, PARTS, EACH = 1, 50, 4  # seeds of every test run, in parts that workers share: two minutes of a core
 NIGHTLY, NIGHTLY_PARTS, NIGHTLY_EACH = 100_000, 50, 96  # seeds that make 5,000 with the others
 
 TRACES = """
