@@ -32,9 +32,9 @@ from tests.simulated import bodies, flight, laboratory
 from tests.simulated.world import current
 from twins.arrays import Array
 
-PERIOD_S = 1.0 / 30.0  # of each camera
+PERIOD_S = 1.0 / 30.0  # time between two images of a camera [s]
 CAMERAS = "ABCD"
-DELAY_S = 0.05  # from an exposure to its frame: transfer, JPEG, search
+DELAY_S = 0.05  # time from an exposure to its frame: transfer, JPEG, search [s]
 VICON = 0.01, 0.004, 0.0003  # period [s], latency [s], standard deviation of a position [m]
 WHEELS = {"TB01": (1, 0.10, 0.20, True), **{f"KH0{k}": (k + 1, 0.10, 0.14, True) for k in (1, 2, 3)}}
 SEEDS = (1, 2, 3)

@@ -56,7 +56,8 @@ def parameter_faults(chosen: Mapping[str, float], unprotected: Collection[str] =
                 yield ParameterFault(name, f"{name} = {value:g} is no choice", f"choose {low} to {high}")
         elif default and name not in unprotected and not default / TIMES <= value <= default * TIMES:
             message = f"{name} = {value:g} is far from the firmware's own {default:g}"
-            yield ParameterFault(name, message, f"choose {default / TIMES:g} to {default * TIMES:g}")
+            most = default * TIMES if whole is None else min(default * TIMES, whole[-1])
+            yield ParameterFault(name, message, f"choose {default / TIMES:g} to {most:g}")
         elif not isfinite(value) or value < 0.0:
             yield ParameterFault(name, f"{name} = {value:g} is no gain", "choose a value from 0 on")
 

@@ -1,4 +1,4 @@
-"""One device has one driver, whatever its address is called: locks and the names of a host."""
+"""Locks of devices: a single driver for each, by all names of its host."""
 
 import ipaddress
 import socket
@@ -34,7 +34,7 @@ def test_device_has_one_holder_until_released(runtime_folder):
         second.take()
     second.release()  # refused: what the first has is left alone
     assert len(list(runtime_folder.iterdir())) == 2
-    claims(("C", "three")).take()  # which the second has let go of
+    claims(("C", "three")).take()  # the second process has let go of it
     first.release()
     second.release()
     first.release()

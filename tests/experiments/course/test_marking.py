@@ -153,7 +153,7 @@ def test_wrong_calls_are_refused(course, tmp_path):
     assert "holds no exercise" in str(invoke("course", tmp_path / "new", "--from", tmp_path, code=1).exception)
 
 
-FORKS = "(os.fork() or open('begun', 'x'), time.sleep(600))"  # with a child of its own
+FORKS = "(os.fork() or open('begun', 'x'), time.sleep(600))"  # a law that starts a child
 
 
 @pytest.mark.slow
