@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from math import isfinite
@@ -15,7 +15,13 @@ Rows = Literal["receivers", "senders"]
 
 NUMBERS: Final = ("weight", "distance", "gain", "from_s", "until_s")  # attributes of an edge that are read
 LABELS: Final = ("label", "name")  # attributes of a node that may be the name of a robot
+HEADS: Final = (("source", "target"), ("from", "to"), ("sender", "receiver"))  # columns with the ends of an edge
+TYPE: Final = "type"  # column in which Gephi says whether an edge is directed
+UNREAD: Final = ("", "id", "label", "timeset", TYPE)  # further columns of pandas and Gephi
 SIGNS: Final = (">", "-")  # signs of a link
+ATTRIBUTE: Final = re.compile(
+    rf"['\"]({'|'.join(NUMBERS)})['\"]\s*:\s*([^\s,}}]+)"
+)  # entry of a dictionary of networkx
 SAME: Final = 1e-9  # difference of two weights that are equal
 WHICH: Final = (
     'write rows = "receivers" where a row receives from its columns, as in a consensus law, or rows = "senders" where '
@@ -49,7 +55,7 @@ def read(text: str, robots: Sequence[str], *, directed: bool = False, rows: Rows
         GraphError: If it is none of the formats, or ends of an edge are missing.
     """
     if text.lstrip().startswith("<"):
-        return _graphml(text)
+        return _GraphML(expat.ParserCreate()).read(text, robots)
     lines = [(number, line.partition("#")[0].strip()) for number, line in enumerate(text.split("\n"), 1)]
     cells = [(number, _cells(line)) for number, line in lines if line]
     if not cells:
@@ -63,12 +69,16 @@ def read(text: str, robots: Sequence[str], *, directed: bool = False, rows: Rows
             hint = "give one row for each robot, a line of names above them, or edges between names"
             raise GraphError(f"a matrix of {len(cells)} rows without names, and there are {len(robots)} robots; {hint}")
         return _matrix(cells, robots, rows)
-    return [_edge(number, row, directed=directed) for number, row in cells if not _is_header(row)]
+    heads = [name.lower() for name in cells[0][1]]
+    if ends := next((ends for ends in HEADS if {*ends} <= {*heads}), None):
+        return _table(cells, heads, ends, directed=directed)
+    return [_edge(number, row, directed=directed) for number, row in cells]
 
 
 def _cells(line: str) -> list[str]:
+    line, brace, attributes = line.partition("{")
     sign = next((sign for sign in (",", ";", "\t") if sign in line), None)
-    return [cell.strip().strip('"') for cell in line.split(sign)]
+    return [cell.strip().strip('"') for cell in line.split(sign)] + [brace + attributes] * bool(brace)
 
 
 def _is_number(text: str) -> bool:
@@ -78,8 +88,33 @@ def _is_number(text: str) -> bool:
         return False
 
 
-def _is_header(cells: Sequence[str]) -> bool:
-    return [cell.lower() for cell in cells[:2]] in (["source", "target"], ["from", "to"], ["sender", "receiver"])
+def _table(
+    cells: Sequence[tuple[int, list[str]]], heads: Sequence[str], ends: tuple[str, str], *, directed: bool
+) -> list[Edge]:
+    """Edges of a table with names above its columns, of which `ends` hold the robots."""
+    if other := next((name for name in heads if name not in (*ends, *NUMBERS, *UNREAD)), None):
+        raise GraphError(
+            f"line {cells[0][0]}: nothing is known of a column {other!r}; name it {', '.join(NUMBERS)}, or remove it"
+        )
+    found = list[Edge]()
+    for line, row in cells[1:]:
+        given = {name: cell for name, cell in zip(heads, row, strict=False) if cell}
+        sender, receiver = (given.get(end, "") for end in ends)
+        if not sender or not receiver:
+            raise GraphError(f"line {line}: no {ends[0] if receiver else ends[1]}; write the names of two robots")
+        numbers = {name: _number(line, name, cell) for name, cell in given.items() if name in NUMBERS}
+        one_way = given[TYPE].lower() == "directed" if TYPE in given else directed
+        found.append(Edge(sender, receiver, one_way, numbers, line))
+    return found
+
+
+def _number(line: int, name: str, text: str) -> float:
+    """Value of an attribute, in quotes or as numpy prints it, too."""
+    text = text.strip("'\"")
+    value = re.sub(r"^np\.\w+\((.*)\)$", r"\1", text)
+    if not _is_number(value):
+        raise GraphError(f"line {line}: its {name} {text[:40]!r} is no number; mend it")
+    return float(value)
 
 
 def _edge(line: int, cells: Sequence[str], *, directed: bool) -> Edge:
@@ -93,10 +128,8 @@ def _edge(line: int, cells: Sequence[str], *, directed: bool) -> Edge:
         raise GraphError(f"line {line}: {' '.join(cells)[:60]!r} is no edge; write two names and, if wanted, a weight")
     rest = " ".join(words[2:])
     if rest.startswith("{"):
-        found = re.findall(r"['\"](\w+)['\"]\s*:\s*([-+.\deE]+)", rest)
-        return Edge(
-            words[0], words[1], directed, {name: float(value) for name, value in found if _is_number(value)}, line
-        )
+        numbers = {name: _number(line, name, value) for name, value in ATTRIBUTE.findall(rest)}
+        return Edge(words[0], words[1], directed, numbers, line)
     if len(words) > 3 or (rest and not _is_number(rest)):
         raise GraphError(f"line {line}: {rest[:40]!r} is no weight; write two names and, if wanted, a number")
     return Edge(words[0], words[1], directed, {"weight": float(rest)} if rest else {}, line)
@@ -131,73 +164,93 @@ def _matrix(cells: Sequence[tuple[int, list[str]]], names: Sequence[str], rows: 
 
 @dataclass
 class _GraphML:
-    """State of the parser of a GraphML file."""
+    """Reader of a GraphML file; a node is named by its id, or by its label."""
 
+    parser: expat.XMLParserType
     keys: dict[str, str] = field(default_factory=dict)  # names of attributes by their id
+    defaults: dict[str, float] = field(default_factory=dict)  # numbers of edges that do not give them
     labels: dict[str, str] = field(default_factory=dict)  # name of a node by its id
     edges: list[Edge] = field(default_factory=list)
     directed: bool = False  # what edges are that do not say it
     attribute: str = ""  # name of the attribute that is open
+    of_edges: bool = False  # True if the key that is open is for edges
     node: str = ""  # id of the node that is open
+    tag: str = ""  # element of which `text` is the beginning
     text: str = ""
 
+    def read(self, text: str, robots: Collection[str]) -> list[Edge]:
+        """Edges of a file's text; an id that is the name of a robot is taken before a label that is none."""
+        self.parser.StartElementHandler, self.parser.EndElementHandler = self._start, self._end
+        self.parser.CharacterDataHandler, self.parser.StartDoctypeDeclHandler = self._data, self._refuse
+        try:
+            self.parser.Parse(text, True)
+        except expat.ExpatError as error:
+            message = expat.ErrorString(error.code)
+            raise GraphError(
+                f"line {error.lineno}: it is no XML: {message}; write it again with the tool it is from"
+            ) from None
+        if not self.edges:
+            raise GraphError("it holds no edge; GraphML has <edge source=... target=...> in <graph>")
+        found = list[Edge]()
+        for edge in self.edges:
+            sender, receiver = (self._name(node, robots) for node in edge[:2])
+            found.append(Edge(sender, receiver, edge.directed, {**self.defaults, **edge.numbers}, edge.line))
+        return found
 
-def _graphml(text: str) -> list[Edge]:
-    """Edges of a GraphML file; a node is named by its id, or by its label."""
-    seen, parser = _GraphML(), expat.ParserCreate()
+    def _name(self, node: str, robots: Collection[str]) -> str:
+        label = self.labels.get(node, node)
+        return label if label in robots or node not in robots else node
 
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        name, seen.text = tag.rpartition(":")[2], ""
+    def _start(self, tag: str, attributes: dict[str, str]) -> None:
+        self._keep_label()
+        name, line = tag.rpartition(":")[2], self.parser.CurrentLineNumber
+        if not self.tag and name != "graphml":
+            hint = "export GraphML, as networkx.write_graphml does"
+            raise GraphError(f"line {line}: <{name}> begins another format than GraphML; {hint}")
+        self.tag, self.text = name, ""
         if name == "key":
-            seen.keys[attributes.get("id", "")] = attributes.get("attr.name", "").lower()
+            self.attribute, self.of_edges = attributes.get("attr.name", "").lower(), attributes.get("for") != "node"
+            self.keys[attributes.get("id", "")] = self.attribute
         elif name == "graph":
-            seen.directed = attributes.get("edgedefault") == "directed"
+            self.directed = attributes.get("edgedefault") == "directed"
         elif name == "node":
-            seen.node = attributes.get("id", "")
+            self.node = attributes.get("id", "")
         elif name == "data":
-            seen.attribute = seen.keys.get(attributes.get("key", ""), "")
+            self.attribute = self.keys.get(attributes.get("key", ""), "")
         elif name == "edge":
             source, target = attributes.get("source", ""), attributes.get("target", "")
-            line, given = parser.CurrentLineNumber, attributes.get("directed")
             if not source or not target:
                 raise GraphError(f"line {line}: an edge without source and target; give both")
-            directed = seen.directed if given is None else given == "true"
-            seen.edges.append(Edge(source, target, directed, {}, line))
+            given = attributes.get("directed")
+            directed = self.directed if given is None else given == "true"
+            self.edges.append(Edge(source, target, directed, {}, line))
 
-    def end(tag: str) -> None:
-        name, value = tag.rpartition(":")[2], seen.text.strip()
+    def _end(self, tag: str) -> None:
+        self._keep_label()
+        self.tag = tag
+        name, value = tag.rpartition(":")[2], self.text.strip()
         if name == "node":
-            seen.node = ""
-        elif name == "data" and seen.node and seen.attribute in LABELS:
-            seen.labels[seen.node] = value
-        elif name == "data" and not seen.node and seen.edges and seen.attribute in NUMBERS:
-            edge = seen.edges[-1]
-            if not _is_number(value):
-                raise GraphError(f"line {edge.line}: its {seen.attribute} {value[:40]!r} is no number; mend it")
-            seen.edges[-1] = edge._replace(numbers={**edge.numbers, seen.attribute: float(value)})
+            self.node = ""
+        elif name == "default" and self.of_edges and self.attribute in NUMBERS:
+            self.defaults[self.attribute] = _number(self.parser.CurrentLineNumber, self.attribute, value)
+        elif name == "data" and self.node and self.attribute in LABELS:
+            self.labels[self.node] = value
+        elif name == "data" and not self.node and self.edges and self.attribute in NUMBERS:
+            edge = self.edges[-1]
+            number = _number(edge.line, self.attribute, value)
+            self.edges[-1] = edge._replace(numbers={**edge.numbers, self.attribute: number})
 
-    def data(words: str) -> None:
-        seen.text += words
+    def _keep_label(self) -> None:
+        """Keeps the label that yEd draws on a node."""
+        if self.tag == "NodeLabel" and self.text.strip():
+            self.labels.setdefault(self.node, self.text.strip())
 
-    def refuse(*_: object) -> None:
-        raise GraphError(f"line {parser.CurrentLineNumber}: a DOCTYPE or an entity, which no graph needs; remove it")
+    def _data(self, words: str) -> None:
+        self.text += words
 
-    parser.StartElementHandler, parser.EndElementHandler = start, end
-    parser.CharacterDataHandler, parser.StartDoctypeDeclHandler = data, refuse
-    try:
-        parser.Parse(text, True)
-    except expat.ExpatError as error:
-        message = expat.ErrorString(error.code)
-        raise GraphError(
-            f"line {error.lineno}: it is no XML: {message}; write it again with the tool it is from"
-        ) from None
-    if not seen.edges:
-        raise GraphError("it holds no edge; GraphML has <edge source=... target=...> in <graph>")
-    names = seen.labels
-    return [
-        edge._replace(sender=names.get(edge.sender, edge.sender), receiver=names.get(edge.receiver, edge.receiver))
-        for edge in seen.edges
-    ]
+    def _refuse(self, *_: object) -> None:
+        line = self.parser.CurrentLineNumber
+        raise GraphError(f"line {line}: a DOCTYPE or an entity, which no graph needs; remove it")
 
 
 def repeated(edges: Sequence[Edge]) -> tuple[Edge, Edge] | None:

@@ -62,10 +62,27 @@ MATRIX = ",A,B,C\nA,0,1,\nB,0,0,1\nC,0,0,0\n"
          {"A - B": {"distance": 1.0}, "A - C": {"distance": 0.5}, "B - C": {"distance": 2.0}}),
         ("# a list\nA > B 2\nB - C\n", "", {"A > B": {"distance": 0.7, "gain": 2.0}, "B - C": {"distance": 0.7}}),
         ("source;target;weight\nA;B;3\n", ', weight = "nothing"', {"A - B": {"distance": 0.7}}),
+        (",target,source,distance\n0,A,B,0.5\n", ", directed = true", {"B > A": {"distance": 0.5}}),
+        ("Source,Target,Type,Id,Label,timeset,Weight\nA,B,Directed,0,,,3.0\n", "",
+         {"A > B": {"distance": 0.7, "gain": 3.0}}),
+        ("A B {'colour': 'red', 'distance': '0.5'}\n", "", {"A - B": {"distance": 0.5}}),
     ],
 )  # fmt: skip
 def test_edges_are_the_links(write, options, found, links):
     assert links(write, options) == expected(found)
+
+
+@pytest.mark.parametrize("write", [nx.write_edgelist, nx.write_graphml])
+def test_numbers_of_numpy_are_read(write, links):
+    graph = nx.Graph()
+    graph.add_edge("A", "B", distance=np.linalg.norm([0.3, 0.4]))
+    assert links(lambda file: write(graph, file)) == expected({"A - B": {"distance": 0.5}})
+
+
+def test_defaults_of_graphml_are_those_of_its_edges(links):
+    graph = nx.Graph([("A", "B"), ("B", "C", {"distance": 0.9})], edge_default={"distance": 0.5})
+    found = links(lambda file: nx.write_graphml(graph, file))
+    assert found == expected({"A - B": {"distance": 0.5}, "B - C": {"distance": 0.9}})
 
 
 def test_links_of_the_experiment_win(links, tmp_path):
@@ -105,6 +122,10 @@ def graphml(edges, attributes=""):
         (graphml('<edge source="A" target="X"/>'), "line 3: no robot is called 'X'"),
         (graphml('<edge source="A"/>'), "line 3: an edge without source and target"),
         (graphml(""), "holds no edge"),
+        ("\n".join(nx.generate_gexf(ONE_WAY)), "line 1: <gexf> begins another format than GraphML"),
+        ("source,target,length\nA,B,2\n", "line 1: nothing is known of a column 'length'"),
+        ("source,target\nA,\n", "line 2: no target"),
+        ("A B {'weight': None}\n", "line 1: its weight 'None' is no number"),
         ("<graphml>\n<edge\n", "it is no XML"),
         ('<!DOCTYPE g [<!ENTITY a "b">]>\n<graphml/>', "line 1: a DOCTYPE"),
     ],
@@ -117,8 +138,20 @@ def test_other_files_are_refused_with_their_line(text, said, links, tmp_path):
     assert problem.place == f"{tmp_path / 'task.toml'}:8:18"
 
 
-def test_labels_of_nodes_name_the_robots(links):
-    nodes = '<node id="n0"><data key="d">A</data></node><node id="n1"><data key="d">C</data></node>'
+YED = '<y:NodeLabel x="1.0">{}<y:LabelModel>\n</y:LabelModel></y:NodeLabel>'  # as yEd draws it
+LABELLED = '<node id="n0"><data key="d">{}</data></node><node id="n1"><data key="d">{}</data></node>'
+
+
+@pytest.mark.parametrize("label", ["{}", YED])
+def test_labels_of_nodes_name_the_robots(label, links):
+    nodes = LABELLED.format(label.format("A"), label.format("C"))
     text = graphml(f'{nodes}<edge source="n0" target="n1" directed="true"/>')
-    text = text.replace("<graphml>", '<graphml><key id="d" for="node" attr.name="label"/>')
+    name = ' attr.name="label"' if label == "{}" else ""
+    text = text.replace("<graphml>", f'<graphml xmlns:y="yEd"><key id="d" for="node"{name}/>')
     assert links(text) == expected({"A > C": {"distance": 0.7}})
+
+
+def test_labels_that_are_no_robots_leave_the_ids(links):
+    graph = nx.Graph([("A", "B")])
+    nx.set_node_attributes(graph, {"A": "leader", "B": "left"}, "label")
+    assert links(lambda file: nx.write_graphml(graph, file)) == expected({"A - B": {"distance": 0.7}})
