@@ -19,9 +19,8 @@ HEADS: Final = (("source", "target"), ("from", "to"), ("sender", "receiver"))  #
 TYPE: Final = "type"  # column in which Gephi says whether an edge is directed
 UNREAD: Final = ("", "id", "label", "timeset", TYPE)  # further columns of pandas and Gephi
 SIGNS: Final = (">", "-")  # signs of a link
-ATTRIBUTE: Final = re.compile(
-    rf"['\"]({'|'.join(NUMBERS)})['\"]\s*:\s*([^\s,}}]+)"
-)  # entry of a dictionary of networkx
+# entry of a dictionary of networkx
+ATTRIBUTE: Final = re.compile(rf"['\"]({'|'.join(NUMBERS)})['\"]\s*:\s*([^\s,}}]+)")
 SAME: Final = 1e-9  # difference of two weights that are equal
 WHICH: Final = (
     'write rows = "receivers" where a row receives from its columns, as in a consensus law, or rows = "senders" where '
