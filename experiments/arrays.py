@@ -25,12 +25,16 @@ def known_rows(values: Iterable[Sequence[float] | float | None], width: int = 1)
 
 
 def data_frame(columns: Mapping[str, Any]) -> Any:  # noqa: ANN401 - of pandas or of polars
-    """Columns as a data frame of pandas, or of polars where only that is installed; raises ImportError without both."""
+    """Columns as a data frame of pandas, or of polars where only that is installed; raises ImportError without both.
+
+    NaN becomes null in polars: its means leave out nulls alone, and its comparisons take NaN for the largest number.
+    """
     for library in ("pandas", "polars"):
         try:
-            return importlib.import_module(library).DataFrame(columns)
+            frame = importlib.import_module(library).DataFrame(columns)
         except ModuleNotFoundError:
             continue
+        return frame if library == "pandas" else frame.fill_nan(None)
     raise ImportError("neither pandas nor polars is installed; `./zenpark install pandas` installs one of them")
 
 

@@ -126,7 +126,8 @@ class Run:
     def to_frame(self) -> Any:  # noqa: ANN401 - of pandas or of polars
         """Metrics as a data frame of pandas, or of polars where only that is installed: a row per case and robot.
 
-        Columns are those of `metrics.csv`; an unknown number is NaN. Raises ImportError if neither is installed.
+        Columns are those of `metrics.csv`; an unknown number is NaN, in polars null. Raises ImportError if neither is
+        installed.
         """
         rows = list(metrics_files.rows(list(self.metrics.values())))
         return data_frame({name: _column([row[name] for row in rows]) for name in (rows[0] if rows else ())})

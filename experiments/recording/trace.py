@@ -201,7 +201,7 @@ class Trace:
         """Time series as a data frame of pandas, or of polars where only that is installed: a row per time and robot.
 
         Columns are case, time [s], robot, and `columns`, as `./zenpark export --csv` writes them; an unknown number is
-        NaN. Raises ImportError if neither is installed.
+        NaN, in polars null. Raises ImportError if neither is installed.
         """
         rows, count = len(self.time), len(self.robots)
         heads = {

@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
@@ -32,6 +32,7 @@ KEYWORDS: Final = frozenset(
         *("otherwise", "parfor", "persistent", "return", "spmd", "switch", "try", "while"),
     }
 )
+FIELD: Final = re.compile(r"[A-Za-z]\w*", re.ASCII)
 UNITS: Final[dict[str, Any]] = {
     "time": "s since the common start",
     "position": "m, as measured; time x robot x axis",
@@ -180,8 +181,9 @@ def converted(value: Any) -> Any:  # noqa: ANN401 - any field of a struct
     """A value as `savemat` takes it: a number as double, unknown as NaN, an array of texts for a cell array."""
     match value:
         case dict():
-            names = matlab_names(name for name in value if not name.isidentifier())  # metrics in files
-            return {names.get(name, name): converted(each) for name, each in value.items()}
+            plain_first = sorted(value, key=lambda name: not FIELD.fullmatch(name))
+            names = matlab_names(plain_first, keywords=())  # a field may have the name of one, such as `case`
+            return {names[name]: converted(each) for name, each in value.items()}
         case str():
             return value
         case list() | tuple() if all(isinstance(each, str) for each in value):
@@ -192,12 +194,12 @@ def converted(value: Any) -> Any:  # noqa: ANN401 - any field of a struct
             return math.nan if value is None else float(value)
 
 
-def matlab_names(names: Iterable[str]) -> dict[str, str]:
+def matlab_names(names: Iterable[str], keywords: Container[str] = KEYWORDS) -> dict[str, str]:
     """For each name one that MATLAB allows: letters, digits and _, a letter first, no keyword; each another."""
     found: dict[str, str] = {}
     for name in names:
         plain = re.sub(r"\W", "_", name, flags=re.ASCII)
-        if not re.match(r"[A-Za-z]", plain) or plain in KEYWORDS:
+        if not re.match(r"[A-Za-z]", plain) or plain in keywords:
             plain = f"case_{plain}"
         short, number = plain[:LONGEST], 2
         while short in found.values():

@@ -98,14 +98,25 @@ def test_figures_show_themselves_and_are_kept(crowded, tmp_path):
     assert sorted(path.name for path in (tmp_path / "figures").iterdir()) == ["errors.pdf", "errors.svg"]
 
 
+class Frame(dict):
+    """Data frame of either library, which keeps what has replaced NaN."""
+
+    unknown = "NaN"
+
+    def fill_nan(self, value):
+        self.unknown = value
+        return self
+
+
 @pytest.mark.parametrize("installed", ["pandas", "polars"])
 def test_frames_are_of_the_library_that_is_there(crowded, monkeypatch, installed):
     for library in ("pandas", "polars"):
         monkeypatch.setitem(sys.modules, library, None)  # its import fails
     with pytest.raises(ImportError, match="neither pandas nor polars"):
         crowded.to_frame()
-    monkeypatch.setitem(sys.modules, installed, SimpleNamespace(DataFrame=lambda columns: columns))
+    monkeypatch.setitem(sys.modules, installed, SimpleNamespace(DataFrame=Frame))
     columns = crowded.to_frame()
+    assert columns.unknown == {"pandas": "NaN", "polars": None}[installed]
     assert columns["robot"] == ["CF01", "CF02", "CF03"]
     assert {"seed", "case", "f_hz", "iae", "near_gap"} <= columns.keys()
     assert [type(each) for each in columns["acquired_s"]] == [float] * 3, "none has acquired: NaN"

@@ -14,7 +14,7 @@ from experiments.definition.experiment import Formation, LinkTable
 from experiments.definition.graph import adjacency
 from experiments.metrics.signals import Measurement
 from experiments.report import export
-from experiments.report.export import UNITS, matlab_names, structure
+from experiments.report.export import UNITS, converted, matlab_names, structure
 from experiments.report.page import Table, TableRow
 from experiments.report.typeset import latex, markdown
 from tests.runs import fly, recorded
@@ -141,6 +141,13 @@ def test_names_are_valid_in_matlab():
     given = ["periodic", "5mm", "a.b", "a-b", "a_b_2", "a_b", "end", "case_end", "x" * 70, "x" * 71]
     found = ["periodic", "case_5mm", "a_b", "a_b_2", "a_b_2_2", "a_b_3", "case_end", "case_end_2"]
     assert list(matlab_names(given).values()) == [*found, "x" * 63, "x" * 61 + "_2"]
+
+
+def test_variables_of_laws_are_not_lost(tmp_path):
+    memory = {"_phase": 1.0, "a-b": 2.0, "a_b": 3.0, "λ": 4.0, "end": 5.0}
+    scipy_io.savemat(tmp_path / "x.mat", {"s": converted({"case": "c", "memory": memory})})
+    read = scipy_io.loadmat(tmp_path / "x.mat", simplify_cells=True)["s"]
+    assert read == {"case": "c", "memory": {"case__phase": 1.0, "a_b_2": 2.0, "a_b": 3.0, "case__": 4.0, "end": 5.0}}
 
 
 def test_what_cannot_be_exported_is_explained(recorded_run, tmp_path, monkeypatch):
