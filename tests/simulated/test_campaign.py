@@ -60,6 +60,7 @@ def test_seeds_repeat_to_the_last_switch():
     assert len(set(printed.pop().splitlines())) == len(seeds)
 
 
+@pytest.mark.slow
 def test_flight_asks_nothing_of_the_real_world():
     asks = laboratory.Mutant("agents/runtime/loop.py", "self._read(t)\n", "self._read(t + 0.0 * time.time_ns())\n")
     with pytest.raises(laboratory.SimulatorError, match=r"asks the real world: time\.time_ns"):

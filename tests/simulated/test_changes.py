@@ -6,6 +6,7 @@ from tests.simulated.faults import Fault
 from tests.simulated.laboratory import fly
 from tests.simulated.small import DRONE, TRIO
 
+pytestmark = pytest.mark.slow
 SPARES = """
 [robots.D]
 kind = "khepera4"

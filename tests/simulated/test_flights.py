@@ -2,11 +2,14 @@
 
 import re
 
+import pytest
+
 from tests.simulated.experiments import MIX
 from tests.simulated.faults import Fault
 from tests.simulated.laboratory import Flight, fly
 
 SPAN_S = 8.0
+pytestmark = pytest.mark.slow
 
 
 def triangle(*script: Fault, **options) -> Flight:

@@ -5,6 +5,7 @@ from math import inf
 
 import pytest
 
+from tests.cases import mostly_slow
 from tests.simulated.faults import Fault
 from tests.simulated.laboratory import fly
 from tests.simulated.small import DRONE, PAIR, TRIO
@@ -82,7 +83,7 @@ ROWS = {
 }
 
 
-@pytest.mark.parametrize("name", ROWS)
+@pytest.mark.parametrize("name", mostly_slow(ROWS, 4))
 def test_exit_code(name):
     run = ROWS[name]
     flight = fly(run.experiment, *run.faults, clocks=run.clocks, settings=[*QUICK, *run.settings])

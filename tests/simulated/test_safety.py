@@ -5,6 +5,7 @@ from math import inf
 
 import pytest
 
+from tests.cases import mostly_slow
 from tests.simulated.faults import Fault
 from tests.simulated.laboratory import fly
 from tests.simulated.small import AT_S, DRONE, TICK_S, TRIO, body, hall
@@ -90,7 +91,7 @@ def hazards():
     return fly_rows(ROWS, 5.6, DRIVE) | fly_rows(LONG_ROWS, 12.5)
 
 
-@pytest.mark.parametrize("name", [*ROWS, *LONG_ROWS])
+@pytest.mark.parametrize("name", mostly_slow([*ROWS, *LONG_ROWS], 4))
 def test_hazard_of_one_robot(name, hazards):
     check_row(name, hazards[name])
 
@@ -151,7 +152,7 @@ def test_former_owner_commands_nothing():
     assert back + 2.5 <= former.ended < back + 2.5 + 0.5
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", mostly_slow([1, 2], 2))
 def test_two_robots_of_a_process_keep_their_names(seed):
     """They hear each other, and such a session gets empty answers to its questions about tokens."""
     back = 3.5

@@ -24,6 +24,7 @@ from bridges.motion_capture.twin.cameras import CamerasTwin, ImageClient, Sheet,
 from bridges.motion_capture.twin.capture import upright
 from tests.bridges.motion_capture.cameras_lab import CORNERS, FLOOR, Room, hung, moved, text
 from tests.bridges.motion_capture.test_systems import ALL, BEGIN, FAULTS, LASTS, fault
+from tests.cases import mostly_slow
 from tests.waiting import PATIENCE_S, until
 from twins.device import Faults, serve_until_next
 
@@ -283,6 +284,7 @@ def test_coverage_is_told_before_cameras_hang(tmp_path):
         list(coverage.report(path, (2.0, 2.0, 1.0)))
 
 
+@pytest.mark.slow
 def test_tags_are_seen_where_coverage_says():
     """Of 240 places that were tried once 96 % were seen, of those not called so 59 %."""
     seen = lab({"CF01": (4, 0.08, 0.03, False)})
@@ -346,7 +348,7 @@ class Line:
 SMALL = {"size": (800, 600), "view_deg": 71.08}
 
 
-@pytest.mark.parametrize("name", [*FAULTS, "damaged"])
+@pytest.mark.parametrize("name", mostly_slow([*FAULTS, "damaged"], 4))
 def test_each_fault_of_cameras(tmp_path, name):
     faults, hidden, _ = FAULTS.get(name, (fault(name), ALL, ""))
     line = Line(tmp_path, **faults)
@@ -398,6 +400,7 @@ def board(camera, k, rng):
     return Sheet(BOARD.generateImage((800, 600)), (centre + outline @ turn.T) @ camera.rotation + camera.place)
 
 
+@pytest.mark.slow
 def test_a_lab_is_calibrated_by_board_and_floor(tmp_path):
     true, rng, said = lab(cameras="A"), np.random.default_rng(3), []
     models = {name: CameraModel(each) for name, each in true.measured.items()}

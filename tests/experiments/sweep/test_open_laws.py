@@ -48,6 +48,7 @@ cases.periodic.trigger = { kind = "periodic", period_s = 0.1 }
 cases.event.trigger = { kind = "send-on-delta", threshold = 0.01 }
 criteria = [{ metric = "place.py:Place", at_most = 2.0 }]
 """
+pytestmark = pytest.mark.slow
 OWN = 'formation.law="own.py:Counting"'
 
 
