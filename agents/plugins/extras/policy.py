@@ -33,6 +33,7 @@ PLANAR: Final = 2  # numbers of an action
 JUDGED: Final = 3  # numbers that a learned trigger judges
 MOST: Final = 1e6  # input of a learned trigger for an infinite number
 ACTIONS: Final = ("velocity", "goal")
+FLOAT: Final = "tensor(float)"
 MEMORY: Final = "memory"  # variable with the state of a recurrent policy
 OBSERVES, EACH, ACTION = "observes", "observes_each", "action"  # keys of the metadata of a model
 
@@ -176,14 +177,10 @@ def read(model: str, what: str) -> LearnedModel:
     except Exception as error:  # noqa: BLE001 - its own exceptions have no common base
         raise PluginError(f"the {what} cannot use its file: {str(error).splitlines()[0]}") from None
     takes, gives = session.get_inputs(), session.get_outputs()
-    plain = len(takes) == len(gives) and len(takes) in (1, 2) and all(map(_is_row, (*takes, *gives)))
-    sizes = [each.shape[-1] for each in (*takes, *gives)] if plain else []
-    if not plain or (len(takes) == 2 and sizes[1] != sizes[3]):
-        shapes = "; ".join(f"{each.name}: {each.type} {each.shape}" for each in (*takes, *gives))
-        raise PluginError(
-            f"the {what} needs a model of one float input and one float output, and with a memory of a second one of "
-            f"each, both of one size; this has {shapes}"
-        )
+    plain = len(takes) == len(gives) and len(takes) in (1, 2) and all(map(_is_row, takes))
+    if not plain or any(each.type != FLOAT for each in gives):
+        raise _unfit(what, takes, gives)
+    size, memory = takes[0].shape[-1], takes[1].shape[-1] if len(takes) == 2 else 0
     ends = [(each.name, [1] * (len(each.shape) - 1) + [each.shape[-1]]) for each in takes]
 
     def act(inputs: Sequence[float], memory: Values) -> tuple[Values, Values]:
@@ -192,15 +189,29 @@ def read(model: str, what: str) -> LearnedModel:
         found, *state = (tuple(each.ravel().tolist()) for each in session.run(None, feed))
         return found, state[0] if state else ()
 
-    memory = sizes[1] if len(takes) == 2 else 0
-    return LearnedModel(sizes[0], sizes[len(takes)], memory, session.get_modelmeta().custom_metadata_map, act)
+    try:  # outputs may have other sizes than they declare: networks of scikit-learn declare one number (skl2onnx 1.20)
+        found, state = act((0.0,) * size, (0.0,) * memory)
+    except Exception as error:  # noqa: BLE001 - as above
+        raise PluginError(f"the {what} cannot use its file: {str(error).splitlines()[0]}") from None
+    if len(state) != memory:
+        raise _unfit(what, takes, gives)
+    return LearnedModel(size, len(found), memory, session.get_modelmeta().custom_metadata_map, act)
 
 
-def _is_row(end: Any) -> bool:  # noqa: ANN401 - an input or an output
-    """Whether it has one row of numbers, of a known length."""
+def _unfit(what: str, takes: Sequence[Any], gives: Sequence[Any]) -> PluginError:
+    """Error of a model with these inputs and outputs."""
+    shapes = "; ".join(f"{each.name}: {each.type} {each.shape}" for each in (*takes, *gives))
+    return PluginError(
+        f"the {what} needs a model of one float input and one float output, and with a memory of a second one of "
+        f"each, both of one size; this has {shapes}"
+    )
+
+
+def _is_row(end: Any) -> bool:  # noqa: ANN401 - of onnxruntime
+    """Whether an input is one row of numbers, of a known length."""
     *rows, last = end.shape or [None]
     single = all(not isinstance(each, int) or each == 1 for each in rows)
-    return end.type == "tensor(float)" and single and isinstance(last, int) and last > 0
+    return end.type == FLOAT and single and isinstance(last, int) and last > 0
 
 
 def _bounded(value: float) -> float:

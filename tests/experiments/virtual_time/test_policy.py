@@ -118,6 +118,17 @@ def test_what_is_no_policy_is_refused(tmp_path, monkeypatch):
         policy.load("not cached")
 
 
+def test_an_action_in_one_column_is_read():
+    """A network of scikit-learn, as skl2onnx 1.20 writes it, declares one number and gives two rows of one."""
+    made = onnx.load_from_string(learned_bytes(16, 2, weights=((1.0, 0.0), *[(0.0, 2.0)] * 15)))
+    column = onnx.numpy_helper.from_array(np.array([-1, 1]), "column")
+    made.graph.initializer.append(column)
+    made.graph.node.append(onnx.helper.make_node("Reshape", ["v", "column"], ["w2"]))
+    made.graph.output[0].CopyFrom(onnx.helper.make_tensor_value_info("w2", 1, [None, 1]))
+    _, read = policy.load(b64encode(made.SerializeToString()).decode())
+    assert read.act([1.0] * 16, ())[0] == (1.0, 30.0)
+
+
 def test_absent_file_is_a_fault_of_its_line(tmp_path):
     (tmp_path / "long.onnx").write_bytes(bytes(1_000_001))
     faults = {"own": r"own\.onnx cannot be read", "../own": "is no name of a file", "long": "is longer than 1 MB"}
