@@ -45,7 +45,9 @@ class DeviceAddress:
         `hosts` are the addresses of each host, see `resolved`; left out: no name server is asked.
         """
         resolved_to = [(hosts or {}).get(host, ()) for host in self.hosts]
-        places = sorted({*map(canonical, self.hosts), *chain(*resolved_to)}) or [""]
+        places = sorted({*map(canonical, self.hosts), *chain(*resolved_to)} - {""}) or [""]
+        if places == [""] and not any(self.parts):
+            yield self.address.lower(), True  # devices of which nothing is known have the text in common
         written = [("", part) if part else ("",) for part in self.parts]
         for place in places:
             for chosen in product(*written):

@@ -252,7 +252,8 @@ def call_all(calls: Iterable[Callable[[], object]]) -> None:
 
 def shared_devices(robots: Iterable[tuple[BodyEntry, type[Body]]]) -> Iterator[BodyFault]:
     """The faults of robots with one device on one machine, as far as no name server is asked."""
-    owners: dict[tuple[str, str], tuple[str, bool]] = {}  # robot by machine and key of its device, and if it is its own
+    # robot by machine and key of its device, and if it is its own
+    owners: dict[tuple[str, str], tuple[BodyEntry, bool]] = {}
     for each, body in robots:
         try:
             device = body.device_of(each)
@@ -260,11 +261,12 @@ def shared_devices(robots: Iterable[tuple[BodyEntry, type[Body]]]) -> Iterator[B
             continue  # `faults` says so
         keys = [] if device is None else [((each.host, key), own) for key, own in device.lock_keys()]
         known = [(owners[key], own) for key, own in keys if key in owners]
-        if owner := next((name for (name, whole), own in known if whole or own), ""):
-            message = f"{owner} has the same body, {each.address}: one device gets the setpoints of both"
+        if owner := next((entry for (entry, whole), own in known if whole or own), None):
+            other = "" if owner.address == each.address else f", there {owner.address}"
+            message = f"{owner.name} has the same body, {each.address}{other}: one device gets the setpoints of both"
             yield BodyFault(each.name, ("body",), message, body.APART)
             continue
-        owners.update({key: (each.name, own) for key, own in keys})
+        owners.update({key: (each, own) for key, own in keys})
 
 
 def judged(robot: BodyEntry, key: tuple[str | int, ...], parse: Callable[[], object]) -> Iterator[BodyFault]:

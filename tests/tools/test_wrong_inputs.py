@@ -154,6 +154,6 @@ def test_two_robots_with_one_devices_address_are_found(second, same):
             for each in shared_devices((each, TwinBody) for each in entries)
         ]
 
-    message = f"RV01 has the same body, {second}: one device gets the setpoints of both"
+    message = f"RV01 has the same body, {second}, there rover://192.0.2.7:5005: one device gets the setpoints of both"
     assert found("") == ([("error", "RV03", ("body",), message)] if same else [])
     assert found("lab") == []

@@ -128,6 +128,8 @@ def names_of_hosts(monkeypatch):
         ("rover://192.0.2.7:5005", "crawler://lab.example:5005", True),  # whatever word it has
         ("rover://channel7", "rover://channel7/", True),  # no name of a host
         ("rover://0/80", "rover://0/81", False),
+        ("rover://%", "ROVER://%", True),  # neither a host nor anything else
+        ("rover://%", "rover://", False),
         ("rover:///dev/stdin", "rover:///proc/self/fd/0", True),  # links to files
     ],
 )
