@@ -62,7 +62,7 @@ def _become_station(words: list[str]) -> None:
         from agents.network.shutdown import end  # noqa: PLC0415
         from experiments.real_time.processes.robot import main as robot  # noqa: PLC0415
 
-        end(robot(words[1:]))
+        end(lambda: robot(words[1:]))
 
 
 def main() -> None:

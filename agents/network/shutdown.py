@@ -10,7 +10,8 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+import traceback
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Final, NoReturn
 
@@ -47,17 +48,29 @@ def closing_cleanly(session: zenoh.Session) -> Iterator[tuple[zenoh.Session, lis
         leave(session, declared)
 
 
-def end(code: int) -> NoReturn:
-    """Ends the process, at once if a daemon thread of it is alive.
+def end(main: Callable[[], int]) -> NoReturn:
+    """Runs a `main` and ends the process with its exit code, after an exception with 1.
 
-    The interpreter would end that thread wherever it is: inside Zenoh, as when a router asks itself or a session is
-    still closing, the process would end by SIGABRT ("FATAL: exception not rethrown").
+    It ends at once after an exception, for which no other thread waits, and while a daemon thread is alive. The
+    interpreter would end that thread wherever it is: inside Zenoh, as when a router asks itself or a session is still
+    closing, the process would end by SIGABRT ("FATAL: exception not rethrown").
     """
-    if any(thread.daemon for thread in threading.enumerate()):
+    code: str | int | None
+    broke = False
+    try:
+        code = main()
+    except SystemExit as left:
+        code = left.code
+    except BaseException:  # noqa: BLE001 - Ctrl-C as well
+        traceback.print_exc()
+        code, broke = 1, True
+    if broke or any(thread.daemon for thread in threading.enumerate()):
+        if isinstance(code, str):
+            print(code, file=sys.stderr)
         for stream in (sys.stdout, sys.stderr):
             with suppress(OSError):  # its reader has gone, or its disk is full
                 stream.flush()
-        os._exit(code)
+        os._exit(code if isinstance(code, int) else int(code is not None))
     sys.exit(code)
 
 

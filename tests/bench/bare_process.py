@@ -41,4 +41,4 @@ def main(endpoint: str, name: str, hz: str, *neighbours: str) -> int:
 
 
 if __name__ == "__main__":
-    end(main(*sys.argv[1:]))
+    end(lambda: main(*sys.argv[1:]))

@@ -217,4 +217,4 @@ def serve(launch: Launch) -> int:
 
 
 if __name__ == "__main__":
-    end(command_line.run("zenpark centre", Launch, serve))
+    end(lambda: command_line.run("zenpark centre", Launch, serve))

@@ -132,4 +132,4 @@ def _serve(
 
 
 if __name__ == "__main__":
-    end(command_line.run("zenpark twin", TwinLaunch, stand_in, more=(OSError,)))
+    end(lambda: command_line.run("zenpark twin", TwinLaunch, stand_in, more=(OSError,)))

@@ -194,4 +194,4 @@ def record(launch: RecorderLaunch) -> int:
 
 
 if __name__ == "__main__":
-    end(command_line.run("zenpark recorder", RecorderLaunch, record, more=(OSError,)))
+    end(lambda: command_line.run("zenpark recorder", RecorderLaunch, record, more=(OSError,)))

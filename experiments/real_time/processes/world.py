@@ -227,4 +227,4 @@ def _alive(session: zenoh.Session, keys: Keys) -> set[str]:
 
 
 if __name__ == "__main__":
-    end(command_line.run("zenpark world serve", WorldLaunch, serve))
+    end(lambda: command_line.run("zenpark world serve", WorldLaunch, serve))

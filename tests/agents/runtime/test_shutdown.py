@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
+from io import StringIO
 from itertools import repeat
 from typing import Any
 from unittest.mock import Mock
@@ -276,13 +277,22 @@ def test_frozen_process_is_no_hanging_loop():
     assert "landed" in rest
 
 
-@pytest.mark.parametrize(("daemon", "at_once"), [(False, []), (True, [4])])
-def test_no_daemon_thread_outlives_the_interpreter(monkeypatch, daemon, at_once):
-    """Inside Zenoh it would take the process along, by SIGABRT."""
+def breaks() -> int:
+    raise OSError("a defect")
+
+
+@pytest.mark.parametrize(
+    ("main", "daemon", "at_once"),
+    [(lambda: 4, False, []), (lambda: 4, True, [4]), (lambda: sys.exit(4), True, [4]), (breaks, False, [1])],
+    ids=["ends", "daemon", "exits", "breaks"],
+)
+def test_no_thread_outlives_the_main_function(monkeypatch, main, daemon, at_once):
+    """A daemon inside Zenoh would take the process along, by SIGABRT; another one would keep a broken one alive."""
     ended = []
     monkeypatch.setattr(sys, "stdout", Mock(flush=Mock(side_effect=BrokenPipeError)))
     monkeypatch.setattr(os, "_exit", ended.append)
     monkeypatch.setattr(threading, "enumerate", lambda: [threading.main_thread(), threading.Thread(daemon=daemon)])
-    with pytest.raises(SystemExit, match="4"):
-        end(4)
+    monkeypatch.setattr(sys, "stderr", StringIO())
+    with pytest.raises(SystemExit):
+        end(main)
     assert ended == at_once
