@@ -76,11 +76,12 @@ class CaptureReader(ABC):
         return parse_server(address, cls.PORT)
 
     @classmethod  # noqa: B027 - a host has no text
-    def check(cls, text: str, label: str, flies: Mapping[str, bool]) -> None:
+    def check(cls, text: str, label: str, flies: Mapping[str, bool], *, simulated: bool = False) -> None:
         """Check the text of a file that is the address; raises ValueError with place and remedy.
 
         Args:
             flies: Whether a body is that of a robot that flies, by name.
+            simulated: Whether the file is read by the protocol twin as well.
         """
 
 

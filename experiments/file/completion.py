@@ -122,7 +122,7 @@ def capture_file(
     measured = {name: robot for name, robot in experiment.robots.items() if robot.position == "external"}
     flies = {capture.names.get(name, name): robot.hover is not None for name, robot in measured.items()}
     try:
-        reader.check(content.decode(errors="replace"), capture.address, flies)
+        reader.check(content.decode(errors="replace"), capture.address, flies, simulated=capture.simulated)
     except ValueError as error:
         message, _, remedy = str(error).partition("; ")
         return [Fault(path, message, remedy)], {}

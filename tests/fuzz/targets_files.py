@@ -184,6 +184,7 @@ def crazyflies_yaml():
 def trajectories():
     """Plans from files: each can be asked for any time."""
     examples = ["t,x,y,z,yaw\n5,0,0,0.5,0\n6,1,2,0.7,1\n", "0 0 0 1 0 0 0 1\n1 1 0 1 0 0 1 0\n", trajectory_files.VICON]
+    examples.append(trajectory_files.MOTIVE.replace("cf 1", "drone"))
     examples.append(f"{trajectory_files.HEADER}\n{trajectory_files.piece(2, x=(0, 1), yaw=(0.5,))}\n")
 
     def take(data):

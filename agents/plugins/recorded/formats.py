@@ -1,4 +1,5 @@
-"""Formats of files with poses over time: CSV with named columns, TUM, Vicon's export, polynomials of Crazyswarm.
+"""Formats of files with poses over time: CSV with named columns, TUM, exports of Vicon and Motive, Crazyswarm's
+polynomials.
 
 The text itself shows its format. Errors name the line, and behind `; ` the remedy.
 """
@@ -6,7 +7,7 @@ The text itself shows its format. Errors name the line, and behind `; ` the reme
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import pairwise
 from math import atan2, cos, hypot, isfinite, nan, radians, sin
 from typing import Final, NamedTuple
@@ -17,8 +18,8 @@ from agents.plugins.recorded.curves import AXES, ORDER, Curve, Piece, Polynomial
 Rows = Sequence[tuple[int, list[str]]]  # numbers of lines, and their cells
 
 FORMS: Final = (
-    "a CSV begins with names such as t,x,y,z,yaw; TUM has lines t x y z qx qy qz qw; Vicon's export and Crazyswarm's "
-    "polynomials are known too"
+    "a CSV begins with names such as t,x,y,z,yaw; TUM has lines t x y z qx qy qz qw; the exports of Vicon and Motive, "
+    "and Crazyswarm's polynomials are known too"
 )
 UNITS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "m": 1.0, "cm": 1e-2, "mm": 1e-3, "rad": 1.0}
 UNITS_OF_ANGLES: Final = {"deg": radians(1.0), "°": radians(1.0)}
@@ -33,10 +34,14 @@ NAMES: Final = {  # names of a column, in small letters and without its unit
     "qz": ("qz", "q_z", "orientation_z"),
     "qw": ("qw", "q_w", "orientation_w"),
 }
-QUATERNION: Final = ("qx", "qy", "qz", "qw")
+QUATERNION: Final = ("qx", "qy", "qz", "qw")  # of any length
+VECTOR: Final = ("rx", "ry", "rz")
 COLUMNS: Final = {name: column for column, names in NAMES.items() for name in names}
 UNIT: Final = re.compile(r"(.+?)\s*(?:\[\s*([\w°]+)\s*\]|\(\s*([\w°]+)\s*\)|_(ns|us|ms|s|mm|cm|m|rad|deg))")
 VICON_HEADER: Final = "frame,sub frame,"
+MOTIVE_HEADER: Final = "frame,time"
+RIGID_BODY: Final = "Rigid Body"  # kind of a body in Motive's export
+MOTIVE_UNITS: Final = {"meters": 1.0, "centimeters": 1e-2, "millimeters": 1e-3}
 FARTHEST: Final = 1e4  # largest place [m] or angle [rad]
 LARGEST: Final = 1e6  # largest coefficient of a polynomial, and duration of a piece [s]
 LATEST_S: Final = 1e12  # largest time [s]
@@ -48,15 +53,21 @@ class FormatError(ValueError):
     """File that is no trajectory; the text has line and remedy."""
 
 
-def read(text: str, body: str = "") -> Curve:
-    """The trajectory of a file's text; `body` is the object of a file that has several.
+def read(text: str, body: str = "", up: str = "y") -> Curve:
+    """The trajectory of a file's text.
+
+    Args:
+        body: Object of a file that has several.
+        up: Axis of Motive's export that points up; the file does not say it.
 
     Raises FormatError.
     """
     lines = text.lstrip("\ufeff").replace("\r\n", "\n").split("\n")
-    head = next((k for k, line in enumerate(lines[:20]) if line.lower().startswith(VICON_HEADER)), None)
-    if head is not None:
-        return Samples(_vicon(lines, head, body))
+    for head, line in enumerate(lines[:20]):
+        if line.lower().startswith(VICON_HEADER):
+            return Samples(_exported(lines, head, body, _vicon(lines, head, body)))
+        if line.lower().startswith(MOTIVE_HEADER) and head > 1:
+            return Samples(_exported(lines, head, body, _motive(lines, head, body, up)))
     rows = _rows(lines)
     if not rows:
         raise FormatError(f"the file holds no numbers; {FORMS}")
@@ -120,9 +131,8 @@ def _column(name: str, body: str) -> tuple[str, float] | None:
     return (COLUMNS[bare], factor) if bare in COLUMNS else None
 
 
-def _samples(rows: Rows, places: dict[str, int], factors: dict[str, float]) -> list[TimedPose]:
+def _samples(rows: Rows, places: Mapping[str, int], factors: Mapping[str, float]) -> list[TimedPose]:
     found, zero = list[TimedPose](), None
-    turned = all(name in places for name in QUATERNION)
     for number, cells in rows:
         value = {name: factors.get(name, 1.0) * _number(number, cells, place) for name, place in places.items()}
         if abs(value["t"]) > LATEST_S or any(abs(value[name]) > FARTHEST for name in value if name != "t"):
@@ -130,8 +140,8 @@ def _samples(rows: Rows, places: dict[str, int], factors: dict[str, float]) -> l
                 f"line {number}: a place or a time beyond all measure; mend its units, or remove the line"
             )
         zero = value["t"] if zero is None else zero
-        yaw = _yaw(*(value[name] for name in QUATERNION)) if turned else value.get("yaw", nan)
-        found.append(TimedPose(value["t"] - zero, (value["x"], value["y"], value.get("z", nan)), yaw, number))
+        place = value["x"], value["y"], value.get("z", nan)
+        found.append(TimedPose(value["t"] - zero, place, _yaw_of(value), number))
     return _in_order(found)
 
 
@@ -165,8 +175,17 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _yaw(x: float, y: float, z: float, w: float) -> float:
-    """Yaw of a quaternion of any length [rad]."""
+def _yaw_of(value: Mapping[str, float]) -> float:
+    """Yaw of a quaternion, else of a rotation vector, else the number; NaN without any [rad]."""
+    if all(name in value for name in QUATERNION):
+        x, y, z, w = (value[name] for name in QUATERNION)
+    elif all(name in value for name in VECTOR):
+        turn = hypot(*(value[name] for name in VECTOR))
+        share = sin(0.5 * turn) / turn if turn else 0.0
+        x, y, z = (share * value[name] for name in VECTOR)
+        w = cos(0.5 * turn)
+    else:
+        return value.get("yaw", nan)
     return atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
 
 
@@ -188,75 +207,89 @@ def _pieces(rows: Rows) -> list[Piece]:
     return found
 
 
-class _Channel(NamedTuple):
-    """Columns of a body in Vicon's export."""
+class Export(NamedTuple):
+    """Columns of a body in the export of a motion capture system, and the factors of their units."""
 
-    place: dict[str, int]
-    angle: float  # factor of its angles to radians
+    places: dict[str, int]
+    factors: dict[str, float]
 
 
-def _vicon(lines: Sequence[str], head: int, body: str) -> list[TimedPose]:
-    """Poses of a body of Vicon's export: kind, rate, names of the bodies, names of the columns, units, numbers."""
-    try:
-        rate = next(float(line.strip(", ")) for line in lines[:head] if _is_number(line.strip(", ")))
-    except StopIteration:
-        raise FormatError(
-            "no rate stands above its columns; export from Vicon with the header, rate included"
-        ) from None
-    if rate <= 0.0:
-        raise FormatError(f"its rate is {rate:g} Hz; export from Vicon with the header, rate included")
-    channel = _channel(lines, head, body)
-    found, zero = list[TimedPose](), None
+def _exported(lines: Sequence[str], head: int, body: str, columns: Export) -> list[TimedPose]:
+    """Poses of a body below the line `head` with the names of the columns, without frames in which it was hidden."""
+    rows = list[tuple[int, list[str]]]()
     for number, line in enumerate(lines[head + 1 :], head + 2):
-        cells = [cell.strip() for cell in line.split(",")]
-        if not any(cells):
-            if found:
-                break  # the next section of the file
-            continue
-        if not _is_number(cells[0]):
-            continue  # the line of units
-        if any(place >= len(cells) or not cells[place] for place in channel.place.values()):
-            continue  # the body was hidden
-        value = {name: _number(number, cells, place) for name, place in channel.place.items()}
-        time = _number(number, cells, 0) / rate
-        if any(abs(each) > 1e3 * FARTHEST for each in value.values()) or abs(time) > LATEST_S:
-            raise FormatError(f"line {number}: a place or a time beyond all measure; export again")
-        zero = time if zero is None else zero
-        place = 1e-3 * value["tx"], 1e-3 * value["ty"], 1e-3 * value["tz"]
-        found.append(TimedPose(time - zero, place, _vicon_yaw(value, channel.angle), number))
+        cells = _cells(line)
+        if not any(cells) and rows:
+            break  # the next section of the file
+        # neither a line of units, nor one without the body
+        if _is_number(cells[0]) and all(k < len(cells) and cells[k] for k in columns.places.values()):
+            rows.append((number, cells))
+    found = _samples(rows, *columns)
     for before, after in pairwise(found):
         if after.time - before.time > HIDDEN_S:
             message = f"line {after.line}: {body or 'the body'} was hidden for {after.time - before.time:.2g} s"
-            raise FormatError(f"{message}; record again, or fill the gap in Vicon before the export")
-    return _in_order(found)
+            raise FormatError(f"{message}; record again, or fill the gap before the export")
+    return found
 
 
-def _channel(lines: Sequence[str], head: int, body: str) -> _Channel:
-    names = [cell.strip().removeprefix("Global Angle ") for cell in lines[head - 1].split(",")]
-    columns = [cell.strip().lower() for cell in lines[head].split(",")]
-    units = [cell.strip().lower() for cell in (lines[head + 1] if head + 1 < len(lines) else "").split(",")]
-    bodies = {name.partition(":")[0]: place for place, name in enumerate(names) if name and place > 1}
+def _cells(line: str) -> list[str]:
+    return [cell.strip().strip('"') for cell in line.split(",")]
+
+
+def _chosen(bodies: Collection[str], body: str, line: int) -> str:
+    """The body that is asked for, else the only one."""
     if not body and len(bodies) > 1:
-        raise FormatError(f'line {head}: it has {", ".join(bodies)}; write body = "{next(iter(bodies))}", or another')
+        raise FormatError(f'line {line}: it has {", ".join(bodies)}; write body = "{next(iter(bodies))}", or another')
     if body and body not in bodies:
-        raise FormatError(f"line {head}: no body {body!r}; {did_you_mean(body, bodies)}")
-    begin = bodies[body] if body else next(iter(bodies.values()), 2)
-    later = [place for place in bodies.values() if place > begin]
-    place = {name: k for k, name in enumerate(columns[: min(later, default=len(columns))]) if k >= begin}
-    wanted = [name for name in ("rx", "ry", "rz", "rw", "tx", "ty", "tz") if name in place]
-    if not {"tx", "ty", "tz"} <= set(wanted):
+        raise FormatError(f"line {line}: no body {body!r}; {did_you_mean(body, bodies)}")
+    return body or next(iter(bodies), "")
+
+
+def _vicon(lines: Sequence[str], head: int, body: str) -> Export:
+    """Vicon's export: kind, rate, names of the bodies, names of the columns, units, numbers."""
+    rates = [float(line.strip(", ")) for line in lines[:head] if _is_number(line.strip(", "))]
+    if not rates or not rates[0] > 0.0:
+        reason = f"its rate is {rates[0]:g} Hz" if rates else "no rate stands above its columns"
+        raise FormatError(f"{reason}; export from Vicon with the header, rate included")
+    names = [name.removeprefix("Global Angle ") for name in _cells(lines[head - 1])]
+    columns = [cell.lower() for cell in _cells(lines[head])]
+    units = [cell.lower() for cell in _cells(lines[head + 1] if head + 1 < len(lines) else "")]
+    bodies = {name.partition(":")[0]: place for place, name in enumerate(names) if name and place > 1}
+    begin = bodies.get(_chosen(bodies, body, head), 2)
+    end = min((place for place in bodies.values() if place > begin), default=len(columns))
+    place = {name: k for k, name in enumerate(columns[:end]) if k >= begin}
+    if not {"tx", "ty", "tz"} <= place.keys():
         raise FormatError(f"line {head + 1}: no columns TX, TY, TZ; export the objects with their places")
+    turn = QUATERNION if "rw" in place else VECTOR
     unit = units[place["rz"]] if "rz" in place and place["rz"] < len(units) else ""
-    return _Channel({name: place[name] for name in wanted}, UNITS_OF_ANGLES.get(unit, 1.0))
+    places = {"t": 0, **{axis: place[f"t{axis}"] for axis in "xyz"}}
+    places |= {name: place[f"r{name[1]}"] for name in turn if f"r{name[1]}" in place}
+    factors = {"t": 1.0 / rates[0], **dict.fromkeys("xyz", 1e-3)}
+    return Export(places, factors | dict.fromkeys(turn, UNITS_OF_ANGLES.get(unit, 1.0)))
 
 
-def _vicon_yaw(value: dict[str, float], angle: float) -> float:
-    """Yaw of a quaternion, or else of a rotation vector; NaN without either [rad]."""
-    if not {"rx", "ry", "rz"} <= value.keys():
-        return nan
-    x, y, z = value["rx"], value["ry"], value["rz"]
-    if "rw" in value:
-        return _yaw(x, y, z, value["rw"])
-    turn = angle * hypot(x, y, z)
-    share = sin(0.5 * turn) / (turn / angle) if turn else 0.0
-    return _yaw(share * x, share * y, share * z, cos(0.5 * turn))
+def _motive(lines: Sequence[str], head: int, body: str, up: str) -> Export:
+    """Motive's export: its settings, then kinds and names of the bodies, quantities, names of the columns, numbers."""
+    settings = _cells(lines[0])
+    unit = next((value.lower() for key, value in pairwise(settings) if key == "Length Units"), "")
+    if unit not in MOTIVE_UNITS:
+        raise FormatError(f"line 1: no Length Units; export from Motive in {', '.join(MOTIVE_UNITS)}, with the header")
+    above = [_cells(line) for line in lines[:head]]
+    kinds = next((row for row, cells in enumerate(above) if RIGID_BODY in cells), None)
+    if kinds is None:
+        raise FormatError(f"line {head + 1}: no rigid body; export from Motive with Rigid Bodies")
+    names, quantities, axes = above[kinds + 1], above[-1], _cells(lines[head])
+    rigid = [k for k, kind in enumerate(above[kinds]) if kind == RIGID_BODY and k < min(len(names), len(quantities))]
+    name = _chosen(dict.fromkeys(names[k] for k in rigid), body, kinds + 2)
+    found = {f"{quantities[k]} {axes[k]}".lower(): k for k in rigid if names[k] == name and k < len(axes)}
+    if not {f"position {axis}" for axis in "xyz"} <= found.keys():
+        raise FormatError(f"line {head + 1}: no Position X, Y, Z of {name}; export the rigid bodies with their places")
+    axes_of_arena = {"x": ("x", 1.0), "y": ("z", -1.0), "z": ("y", 1.0)} if up == "y" else {a: (a, 1.0) for a in "xyz"}
+    places, factors = {"t": 1}, dict[str, float]()
+    turned = {f"rotation {axis}" for axis in "xyzw"} <= found.keys()  # angles of Euler are not read
+    for axis, (source, sign) in axes_of_arena.items():
+        places[axis], factors[axis] = found[f"position {source}"], sign * MOTIVE_UNITS[unit]
+        if turned:
+            places[f"q{axis}"], factors[f"q{axis}"] = found[f"rotation {source}"], sign
+            places["qw"] = found["rotation w"]
+    return Export(places, factors)

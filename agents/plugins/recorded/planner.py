@@ -6,7 +6,7 @@ from base64 import b64decode
 from collections.abc import Mapping
 from functools import lru_cache
 from math import isfinite
-from typing import Annotated, ClassVar, Final
+from typing import Annotated, ClassVar, Final, Literal
 
 from msgspec import Meta
 
@@ -19,12 +19,13 @@ JUMP: Final = 0.02  # pieces that are farther apart than this do not belong toge
 
 
 class Recorded(Planner, frozen=True):
-    """Poses over time from a file: CSV, TUM, Vicon's export, or polynomials of Crazyswarm; then stay."""
+    """Poses over time from a file: CSV, TUM, exports of Vicon and Motive, or polynomials of Crazyswarm; then stay."""
 
     FILES: ClassVar[Mapping[str, str]] = {"file": "content"}
 
     file: Annotated[str, Meta(min_length=1, description="file beside the experiment file: its name")]
     body: Annotated[str, Meta(description="object in a file with several: its name")] = ""
+    up: Annotated[Literal["y", "z"], Meta(description="axis that points up in an export of Motive")] = "y"
     relative: Annotated[
         bool, Meta(description="from where the robot is when the leg begins; else places are those of the arena")
     ] = False
@@ -47,7 +48,7 @@ class Recorded(Planner, frozen=True):
             return  # its name is at fault, which is said there
         name = self.file
         try:
-            curve = _curve(self.content, self.body)
+            curve = self._curve
         except FormatError as error:
             raise ValueError(f"{name}, {error}") from None
         if isinstance(curve, Polynomials):
@@ -67,8 +68,12 @@ class Recorded(Planner, frozen=True):
         return self.stretch * (self._end - self.from_s)
 
     @property
+    def _curve(self) -> Curve:
+        return _curve(self.content, self.body, self.up)
+
+    @property
     def _end(self) -> float:
-        lasts = _curve(self.content, self.body).duration
+        lasts = self._curve.duration
         return lasts if self.until_s is None else min(self.until_s, lasts)
 
     def target(self, elapsed: float, anchor: Vector, heading: float) -> Pose:
@@ -79,25 +84,25 @@ class Recorded(Planner, frozen=True):
         return x, y, z if isfinite(z) else anchor[2], yaw
 
     def speed(self) -> float:
-        return _curve(self.content, self.body).speed / self.stretch
+        return self._curve.speed / self.stretch
 
     def source(self, elapsed: float) -> str:
         """Place in the file of the target at a time, for people."""
-        line = _curve(self.content, self.body).line(self._time(elapsed))
+        line = self._curve.line(self._time(elapsed))
         return f"{self.file}, line {line}"
 
     def _pose(self, elapsed: float) -> Pose:
-        return _curve(self.content, self.body).pose(self._time(elapsed))
+        return self._curve.pose(self._time(elapsed))
 
     def _time(self, elapsed: float) -> float:
         return min(self.from_s + elapsed / self.stretch, self._end)
 
 
 @lru_cache(maxsize=64)
-def _curve(content: str, body: str) -> Curve:
+def _curve(content: str, body: str, up: str) -> Curve:
     """The curve of a file, kept: each pose is asked for at every tick."""
     try:
         text = b64decode(content).decode("utf-8", errors="replace")
     except ValueError:
         raise FormatError("its content is no base64; leave it out, and name the file") from None
-    return read(text, body)
+    return read(text, body, up)

@@ -30,6 +30,7 @@ AREAS: Final = [f"{row} {column}" for row in ("upper", "middle", "lower") for co
 GOOD_PX: Final = 1.0  # largest mean error of a lens
 PLACE_PX: Final = 1.5  # likewise of a place: corners of large tags are found 1 px inside of them
 FLOOR_TAGS: Final = 3  # least number for a place
+FIRST_S: Final = 10.0  # time for the first image of each camera [s]
 FLOOR_IMAGES: Final = 10  # images, of which the median corners are taken
 
 
@@ -132,14 +133,22 @@ def _hung(
 
 
 def calibrate(
-    lab: CamerasFile, images: Images, say: Callable[[str], None], *, again: bool, limit_s: float
+    lab: CamerasFile,
+    images: Images,
+    say: Callable[[str], None],
+    *,
+    again: bool,
+    limit_s: float,
+    first_s: float = FIRST_S,
 ) -> dict[str, MeasuredCamera]:
     """Calibration of all cameras of a lab; raises CalibrationError.
 
     Args:
         again: Whether lenses that are known are measured again.
         limit_s: Time for the lenses, and for the places [s].
+        first_s: Time for the first image of each camera [s].
     """
+    _wait_for_images(images, set(lab.cameras), first_s)
     lenses = {} if again else dict(lab.measured)
     views = {name: LensViews() for name in lab.cameras if name not in lenses}
     if views:
@@ -179,6 +188,15 @@ def calibrate(
         kind = ", tags of the AprilTag project" if measured[name].half_turn else ""
         say(f"camera {name} hangs at ({x:.2f}, {y:.2f}, {z:.2f}) m: {len(seen)} floor tags, {error:.2f} px{kind}")
     return measured
+
+
+def _wait_for_images(images: Images, silent: set[str], first_s: float) -> None:
+    """Wait until each of the cameras has given an image; raises CalibrationError after `first_s`."""
+    deadline = time.monotonic() + first_s
+    while silent:
+        silent = silent - {name for name, _, _ in images.newest(1.0)}
+        if silent and time.monotonic() > deadline:
+            raise CalibrationError(f"no image in {first_s:g} s from {images.troubles}")
 
 
 def _measured_lens(name: str, views: LensViews, say: Callable[[str], None]) -> MeasuredCamera:

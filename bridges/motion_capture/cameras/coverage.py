@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from math import radians, tan
 from pathlib import Path
 from typing import Final
 
-import cv2
 import numpy as np
 
 from bridges.motion_capture.cameras import file
-from bridges.motion_capture.cameras.file import CamerasFile, CamerasFileError, MeasuredCamera, PlannedCamera, TaggedBody
-from bridges.motion_capture.cameras.vision import CameraModel, View, in_space, on_floor, square
+from bridges.motion_capture.cameras.file import CamerasFileError, TaggedBody
+from bridges.motion_capture.cameras.vision import CameraModel, View, in_space, on_floor, placed, square
 from twins.arrays import Array
 
 FOUND_PX: Final = 14.0  # shortest side of a tag of which 98 % are found by boxes; at 12 px 69 %
@@ -21,34 +19,6 @@ HEIGHTS: Final = 6  # heights of drones
 SIZES: Final = (0.04, 0.05, 0.06, 0.08, 0.1, 0.12, 0.15, 0.2)  # tags that are proposed [m]
 SHORTEST_M, LONGEST_M = 0.1, 100.0  # sides of a room
 ENOUGH: Final = 0.99  # share of the places that is good enough
-
-
-def hung(plan: PlannedCamera) -> MeasuredCamera:
-    """A camera without distortion as it is planned."""
-    ahead = np.subtract(plan.aim, plan.place) / np.linalg.norm(np.subtract(plan.aim, plan.place))
-    right = np.cross(ahead, (0.0, 0.0, 1.0) if np.hypot(ahead[0], ahead[1]) > 1e-3 else (0.0, 1.0, 0.0))
-    right /= np.linalg.norm(right)
-    turn = cv2.Rodrigues(np.stack([right, np.cross(ahead, right), ahead]))[0].ravel().tolist()
-    width, height = plan.size
-    focal = 0.5 * width / tan(0.5 * radians(plan.view_deg))
-    matrix = focal, focal, 0.5 * width, 0.5 * height
-    return MeasuredCamera(plan.size, matrix, (0.0,) * 5, plan.place, tuple(turn))
-
-
-def models(lab: CamerasFile) -> list[CameraModel]:
-    """Cameras where they hang, else where they are planned; raises CamerasFileError for one that is neither."""
-    found = []
-    for name, camera in lab.cameras.items():
-        if name in lab.measured:
-            found.append(CameraModel(lab.measured[name]))
-        elif camera.planned is not None:
-            if camera.planned.aim == camera.planned.place:
-                raise CamerasFileError(f"{name}.planned: aim is its place; write a point in the middle of its image")
-            found.append(CameraModel(hung(camera.planned)))
-        else:
-            example = "{ place = [-1.7, -1.7, 2.6], aim = [0.0, 0.0, 0.3], view_deg = 78.0 }"
-            raise CamerasFileError(f"camera {name} is neither calibrated nor planned; write {name}.planned = {example}")
-    return found
 
 
 def is_seen(cameras: list[CameraModel], body: TaggedBody, size: float, place: tuple[float, float, float]) -> bool:
@@ -85,7 +55,11 @@ def report(path: Path, room: tuple[float, float, float]) -> Iterator[str]:
         given = " ".join(f"{side:g}" for side in room)
         raise CamerasFileError(f"--room {given}: write three sides of {SHORTEST_M:g} to {LONGEST_M:g} m")
     lab = file.read(path)
-    cameras, kinds = models(lab), set[tuple[float, float, bool]]()
+    if missing := sorted(lab.cameras.keys() - (known := placed(lab)).keys()):
+        example = "{ place = [-1.7, -1.7, 2.6], aim = [0.0, 0.0, 0.3], view_deg = 78.0 }"
+        hint = f"write {missing[0]}.planned = {example}"
+        raise CamerasFileError(f"camera {missing[0]} is neither calibrated nor planned; {hint}")
+    cameras, kinds = [CameraModel(each) for each in known.values()], set[tuple[float, float, bool]]()
     for name, body in lab.bodies.items():
         if (key := (body.size, body.height, body.on_floor)) in kinds:
             continue

@@ -35,6 +35,10 @@ class PlannedCamera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     size: tuple[Pixels, Pixels] = (1280, 720)  # width and height of its images [px]
     view_deg: Annotated[float, Meta(gt=0, le=150)] = 78.0  # horizontal field of view [degrees]
 
+    def __post_init__(self) -> None:
+        if self.aim == self.place:
+            raise ValueError("aim is its place; write a point in the middle of its image")
+
 
 class CameraTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Camera of the lab."""

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import http.client
 import math
+import os
 import threading
 import time
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any, Final
 from urllib.parse import urlsplit
 
@@ -44,7 +46,7 @@ class CameraThread(threading.Thread):
                         self.newest, self.trouble = (exposed, image), ""
                         self._arrived.notify()
             except (OSError, http.client.HTTPException, ValueError) as error:
-                self.trouble = str(error) or type(error).__name__
+                self.trouble = getattr(error, "strerror", None) or str(error) or type(error).__name__
             self.over.wait(AGAIN_S)
 
     def _streamed(self) -> Iterator[tuple[float, bytes]]:
@@ -79,6 +81,10 @@ class CameraThread(threading.Thread):
         """Images of a webcam, or of a video file at its own pace."""
         source = self._table.source
         webcam = source.startswith("/dev/")
+        if not Path(source).exists():
+            raise OSError(f"{source} is not there")
+        if not os.access(source, os.R_OK):
+            raise OSError(f"{source} may not be read by you (group video)")
         device: Any = cv2.VideoCapture(source, cv2.CAP_V4L2 if webcam else cv2.CAP_ANY)
         try:
             if not device.isOpened():
@@ -120,6 +126,7 @@ class Images:
     """Newest images of all cameras of a file."""
 
     def __init__(self, file: CamerasFile) -> None:
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # warnings of each attempt at a webcam
         cv2.setNumThreads(1)  # its threads wait for each other for longer than they compute
         self._arrived = threading.Condition()
         self._threads = {n: CameraThread(each, file.rate_hz, self._arrived) for n, each in file.cameras.items()}

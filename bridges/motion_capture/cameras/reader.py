@@ -46,13 +46,15 @@ class CamerasReader(CaptureReader):
         try:
             from bridges.motion_capture.cameras.images import Images  # noqa: PLC0415 - as said above
             from bridges.motion_capture.cameras.tracker import Tracker  # noqa: PLC0415
+            from bridges.motion_capture.cameras.vision import placed  # noqa: PLC0415
         except ImportError as error:
             raise MissingLibraryError(NEEDED) from error
         path, _, twin = host.partition("@")
         lab = file.read(path)
         if twin:
-            cameras = {name: file.CameraTable(f"http://{twin}/{name}") for name in lab.cameras}
-            lab = msgspec.structs.replace(lab, cameras=cameras)
+            measured = placed(lab)
+            cameras = {name: file.CameraTable(f"http://{twin}/{name}") for name in measured}
+            lab = msgspec.structs.replace(lab, cameras=cameras, measured=measured)
         self._tracker = Tracker(lab, lambda line: print(f"cameras: {line}", file=sys.stderr, flush=True))
         self._images, self._number = Images(lab), 0
         self._ahead: CaptureFrame | None = None  # frame of the connection
@@ -81,7 +83,7 @@ class CamerasReader(CaptureReader):
         return address, 0
 
     @classmethod
-    def check(cls, text: str, label: str, flies: Mapping[str, bool]) -> None:
+    def check(cls, text: str, label: str, flies: Mapping[str, bool], *, simulated: bool = False) -> None:
         lab = file.parse(text, label)
         for body, flying in flies.items():
             table = lab.bodies.get(body)
@@ -90,5 +92,7 @@ class CamerasReader(CaptureReader):
                 raise file.CamerasFileError(f"{label}: no [bodies.{body}]; there are: {known}")
             if flying and table.on_floor:
                 raise file.CamerasFileError(f"{label}: [bodies.{body}] is on_floor, but flies; leave on_floor out")
-        if not lab.measured:
-            raise file.CamerasFileError(f"{label}: no camera is calibrated; run ./zenpark cameras calibrate {label}")
+        if not (lab.measured or (simulated and any(camera.planned for camera in lab.cameras.values()))):
+            planned = "give each the key `planned`, or " if simulated else ""
+            hint = f"{planned}run ./zenpark cameras calibrate {label}"
+            raise file.CamerasFileError(f"{label}: no camera is calibrated; {hint}")

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from math import radians, tan
 from typing import Any, Final
 
 import cv2
 import numpy as np
 
-from bridges.motion_capture.cameras.file import MeasuredCamera
+from bridges.motion_capture.cameras.file import CamerasFile, MeasuredCamera, PlannedCamera
 from twins.arrays import Array
 
 FAMILY: Final = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
@@ -59,6 +60,24 @@ class CameraModel:
         rays: Array = np.column_stack([flat, np.ones(len(flat))]) @ self.rotation
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         return rays
+
+
+def hung(plan: PlannedCamera) -> MeasuredCamera:
+    """A camera without distortion as it is planned."""
+    ahead = np.subtract(plan.aim, plan.place) / np.linalg.norm(np.subtract(plan.aim, plan.place))
+    right = np.cross(ahead, (0.0, 0.0, 1.0) if np.hypot(ahead[0], ahead[1]) > 1e-3 else (0.0, 1.0, 0.0))
+    right /= np.linalg.norm(right)
+    turn = cv2.Rodrigues(np.stack([right, np.cross(ahead, right), ahead]))[0].ravel().tolist()
+    width, height = plan.size
+    focal = 0.5 * width / tan(0.5 * radians(plan.view_deg))
+    matrix = focal, focal, 0.5 * width, 0.5 * height
+    return MeasuredCamera(plan.size, matrix, (0.0,) * 5, plan.place, tuple(turn))
+
+
+def placed(lab: CamerasFile) -> dict[str, MeasuredCamera]:
+    """Cameras by name where they hang, else where they are planned; those that are neither are left out."""
+    plans = {name: camera.planned for name, camera in lab.cameras.items() if name not in lab.measured}
+    return {**lab.measured, **{name: hung(plan) for name, plan in plans.items() if plan is not None}}
 
 
 View = tuple[CameraModel, Array]  # a camera, and the corners (4, 2) of a tag in its image [px]

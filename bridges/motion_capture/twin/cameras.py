@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from agents.body.byte_stream import MalformedStream
 from bridges.motion_capture.cameras import file as files
-from bridges.motion_capture.cameras.vision import FAMILY, FLAT, CameraModel, square
+from bridges.motion_capture.cameras.vision import FAMILY, FLAT, CameraModel, placed, square
 from bridges.motion_capture.twin.capture import CaptureClient, SeenBody, StreamTwin
 from twins.arrays import Array
 
@@ -136,16 +136,17 @@ class CamerasTwin(StreamTwin):
     """
 
     def __init__(self, bodies: Sequence[str], *, file: str, **settings: Any) -> None:  # noqa: ANN401 - as of the base
-        """Settings as of `CaptureTwin`; raises ValueError for a file that is not calibrated or lacks a body."""
+        """Settings as of `CaptureTwin`; raises ValueError for a file that lacks a body, or the place of a camera."""
         lab = files.read(file)
         if strangers := [body for body in bodies if body not in lab.bodies]:
             raise ValueError(f"{file}: no [bodies.{strangers[0]}]")
-        if not lab.measured:
-            raise ValueError(f"{file}: no camera is calibrated; run ./zenpark cameras calibrate {file}")
+        cameras = placed(lab)
+        if not cameras:
+            raise ValueError(f"{file}: no camera is calibrated or planned; run ./zenpark cameras calibrate {file}")
         self._file, self._tags = file, lab.bodies
         rng = settings["rng"] = settings.get("rng") or np.random.default_rng(0)
         floor = [sheet(number, square(lab.floor.size, *place)) for number, place in lab.floor.tags.items()]
-        self._images = {name: CameraImages(CameraModel(each), floor, rng) for name, each in lab.measured.items()}
+        self._images = {name: CameraImages(CameraModel(each), floor, rng) for name, each in cameras.items()}
         self._drawn: tuple[Sequence[SeenBody], dict[str, bytes]] = [], {}
         settings["rate_hz"] = min(settings.get("rate_hz", lab.rate_hz), lab.rate_hz)
         super().__init__(bodies, **settings)

@@ -26,6 +26,19 @@ Devices
 """
 
 
+MOTIVE = """Format Version,1.23,Take Name,Take 1,Rotation Type,Quaternion,Length Units,Millimeters
+
+,,"Rigid Body",Rigid Body,Rigid Body,Rigid Body,Rigid Body,Rigid Body,Rigid Body,Rigid Body,Marker,Rigid Body
+,Name,cf 1,cf 1,cf 1,cf 1,cf 1,cf 1,cf 1,cf 1,"cf 1:Marker1",wand
+,ID,"A","A","A","A","A","A","A","A","0","B"
+,,Rotation,Rotation,Rotation,Rotation,Position,Position,Position,Mean Marker Error,Position,Position
+Frame,Time (Seconds),X,Y,Z,W,X,Y,Z,,X,X
+0,0.000000,0,0.707107,0,0.707107,100,300,-200,0.1,1,5
+1,0.100000,,,,,,,,,,5
+2,0.200000,0,0,0,1,200,300,-200,0.1,1,5
+"""
+
+
 def piece(duration, **axes):
     """Line of a piece; of each axis its first coefficients."""
     values = [each for name in ("x", "y", "z", "yaw") for each in (*axes.get(name, ()), *[0] * 8)[:8]]
@@ -49,6 +62,7 @@ def content(text):
         ("# timestamp tx ty tz qx qy qz qw\n1e9 0 0 1 0 0 0 1\n1000000001.0 1 0 1 0 0 1 0\n", "",
          {0.0: (0, 0, 1, 0), 1.0: (1, 0, 1, pi)}),
         (VICON, "drone", {0.0: (0.1, 0.2, 0.3, radians(90)), 0.01: (0.11, 0.2, 0.3, radians(90.5))}),
+        (MOTIVE, "cf 1", {0.0: (0.1, 0.2, 0.3, radians(90)), 0.1: (0.15, 0.2, 0.3, radians(45))}),
         (f"{HEADER}\n{piece(2, x=(0, 1), yaw=(0.5,))}\n{piece(1, x=(2, 1, -0.5), y=(0, 0, 0, 1), yaw=(0.5,))}\n", "",
          {1.0: (1, 0, 0, 0.5), 2.5: (2.375, 0.125, 0, 0.5), 9.0: (2.5, 1, 0, 0.5)}),
     ],
@@ -76,12 +90,16 @@ def test_formats_hold_these_poses(text, body, poses):
         (VICON, 'line 3: it has drone, wand; write body = "drone"'),
         (VICON.replace("100\n", "\n", 1), "no rate stands above"),
         (VICON.replace("TX", "MX"), "line 4: no columns TX"),
+        (MOTIVE, 'line 4: it has cf 1, wand; write body = "cf 1"'),
+        (MOTIVE.replace("Length Units", "Scale"), "line 1: no Length Units; export from Motive in meters"),
+        (MOTIVE.replace("Rigid Body", "Marker"), "line 7: no rigid body; export from Motive with Rigid Bodies"),
+        (MOTIVE.replace("cf 1", "drone").replace("Position", "Place"), "line 7: no Position X, Y, Z of drone"),
         (VICON.replace("13,0", "93,0"), "line 8: drone was hidden for 0.82 s; record again"),
     ],
 )
 def test_other_texts_are_refused_with_their_line(text, said):
     with pytest.raises(FormatError) as raised:
-        read(text, "drone" if "hidden" in said or "TX" in said else "")
+        read(text, "drone" if "drone" in text and "it has" not in said else "")
     assert said in str(raised.value)
 
 

@@ -3,7 +3,7 @@
 import msgspec
 import numpy as np
 
-from bridges.motion_capture.cameras import coverage, file
+from bridges.motion_capture.cameras import file, vision
 from bridges.motion_capture.cameras.file import PlannedCamera
 from bridges.motion_capture.cameras.vision import FLAT, CameraModel, square
 from bridges.motion_capture.twin.cameras import CameraImages, sheet
@@ -14,7 +14,7 @@ FLOOR = {20: (-1.2, -1.2), 21: (1.2, -1.2), 22: (1.2, 1.2), 23: (-1.2, 1.2), 24:
 
 def hung(place, aim=(0.0, 0.0, 0.3), size=(1280, 720), view_deg=83.27):
     """A camera at `place` that looks at `aim`, with a lens that bends straight lines."""
-    straight = coverage.hung(PlannedCamera(place, aim, size, view_deg))
+    straight = vision.hung(PlannedCamera(place, aim, size, view_deg))
     return msgspec.structs.replace(straight, lens=(-0.08, 0.01, 0.0, 0.0, 0.0))
 
 
