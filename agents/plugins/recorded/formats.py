@@ -34,7 +34,7 @@ NAMES: Final = {  # names of a column, in small letters and without its unit
     "qz": ("qz", "q_z", "orientation_z"),
     "qw": ("qw", "q_w", "orientation_w"),
 }
-QUATERNION: Final = ("qx", "qy", "qz", "qw")  # of any length
+QUATERNION: Final = ("qx", "qy", "qz", "qw")
 VECTOR: Final = ("rx", "ry", "rz")
 COLUMNS: Final = {name: column for column, names in NAMES.items() for name in names}
 UNIT: Final = re.compile(r"(.+?)\s*(?:\[\s*([\w°]+)\s*\]|\(\s*([\w°]+)\s*\)|_(ns|us|ms|s|mm|cm|m|rad|deg))")
@@ -278,7 +278,8 @@ def _motive(lines: Sequence[str], head: int, body: str, up: str) -> Export:
     kinds = next((row for row, cells in enumerate(above) if RIGID_BODY in cells), None)
     if kinds is None:
         raise FormatError(f"line {head + 1}: no rigid body; export from Motive with Rigid Bodies")
-    names, quantities, axes = above[kinds + 1], above[-1], _cells(lines[head])
+    names, quantities = above[kinds + 1], above[-1]
+    axes = _cells(lines[head])
     rigid = [k for k, kind in enumerate(above[kinds]) if kind == RIGID_BODY and k < min(len(names), len(quantities))]
     name = _chosen(dict.fromkeys(names[k] for k in rigid), body, kinds + 2)
     found = {f"{quantities[k]} {axes[k]}".lower(): k for k in rigid if names[k] == name and k < len(axes)}
