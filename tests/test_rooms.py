@@ -221,6 +221,7 @@ def test_folders_describe_themselves_and_import_what_they_say():
 SEES_EXPERIMENTS = ("experiments.definition", "experiments.file", "experiments.authoring")
 COMPILES = {"experiments.definition.plan", "experiments.file.document"}
 CHOOSES_PLUGINS = {
+    "experiments.course.cells",  # class of a group, in its process
     "experiments.definition.plan",
     "experiments.file.choices",  # structs of parameters, for the reader
     "experiments.metrics.metric",

@@ -64,6 +64,18 @@ class Disorder(Metric, frozen=True):
         return np.linalg.norm(each[:, None] - each, axis=2).max()
 
 
+class Lag(Metric, frozen=True):
+    """Distance of a robot from its place in the shape, as the leader has it, in the end."""
+
+    label, unit = "Lag", "m"
+
+    def of(self, trace, shared):
+        formation = trace.plan.experiment.formation
+        wanted = np.array([formation.shape[name] for name in trace.robots])
+        off = end(trace)[0] - wanted[:, :2]
+        return np.linalg.norm(off - off[:, [trace.robots.index(formation.leader)]], axis=2).mean(axis=0)
+
+
 class Way(Metric, frozen=True):
     """Length of the path of a robot, without what is shorter than a centimetre in half a second."""
 

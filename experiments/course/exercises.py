@@ -22,7 +22,8 @@ from experiments.file.text import content, parsed
 
 OURS: Final = Path(__file__).parents[2] / "docs" / "course"  # course of zenpark, in a checkout
 _BLANK: Final = re.compile(r"^( *)# blank: (.*)\n(?:.*\n)*?^ *# end of blank\n", re.MULTILINE)
-_PLUGIN_FILE: Final = re.compile(r"[\"']([^\"':/\\]+\.py):")  # Python file that an experiment names
+_PLUGIN: Final = re.compile(r"[\"']([^\"':/\\]+\.py):(\w+)[\"']")  # class in a Python file that an experiment names
+NAMED: Final = (("links",), ("shape",))  # tables in which groups may use names that the solution does not
 Table = Mapping[str, Any]
 
 
@@ -37,14 +38,18 @@ class Exercise:
     Attributes:
         name: Of the file, without its suffix.
         laws: Names of the Python files with blanks that it names.
+        classes: Those in these files that it names, each as `law.py:Meet`.
         blanks: Paths of the values in the file, or of tables with more keys, that are to be filled in.
         posed: Content of the file with the blanks.
+        solved: Content of the file with the solution.
     """
 
     name: str
     laws: tuple[str, ...]
+    classes: tuple[str, ...]
     blanks: tuple[tuple[str, ...], ...]
     posed: Table
+    solved: Table
 
     @property
     def file(self) -> str:
@@ -76,7 +81,8 @@ class Exercise:
         for path in self.blanks:
             asked, value = _at(self.posed, path), _at(given, path)
             if isinstance(asked, Mapping) and isinstance(value, Mapping):
-                yield from (((*path, key), value[key]) for key in value if key not in asked)
+                keys = value if path[-1:] in NAMED else _at(self.solved, path)
+                yield from (((*path, key), value[key]) for key in keys if key in value and key not in asked)
             elif value is not None:
                 yield path, value
 
@@ -105,10 +111,11 @@ def read_course(folder: Path) -> Course:
         if not name.endswith(".toml"):
             continue
         asked, answer = (parsed(texts[name], str(folder / name), json=False) for texts in (files, solved))
-        laws = dict.fromkeys(each for each in _PLUGIN_FILE.findall(solved[name]) if files.get(each) != solved.get(each))
-        if laws or asked != answer:
+        named = [each for each in _PLUGIN.findall(solved[name]) if files.get(each[0]) != solved.get(each[0])]
+        if named or asked != answer:
             stem = name.removesuffix(".toml")
-            exercises[stem] = Exercise(stem, tuple(laws), tuple(_blanks(asked, answer)), asked)
+            laws, classes = dict.fromkeys(file for file, _ in named), dict.fromkeys(map(":".join, named))
+            exercises[stem] = Exercise(stem, tuple(laws), tuple(classes), tuple(_blanks(asked, answer)), asked, answer)
     if not exercises:
         place = "is no folder" if not folder.is_dir() else "holds no exercise"
         raise CourseError(

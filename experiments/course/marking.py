@@ -1,9 +1,9 @@
 """Marks of a course: what groups hand in, judged over seeds that they do not know.
 
-The code of a group runs in a process of its own, with limits of computing time, memory and size of files, in a folder
-that is gone afterwards. Criteria, metrics and all but the blanks are those of the course. The process says its result
-by a pipe at its end: one that ends otherwise has not passed. That keeps out mistakes. It is no prison: code that is
-written to deceive or to harm could do both. However the marking ends, a guard ends these processes with it.
+Each exercise of a group is flown and judged in a process of its own, with the experiment, the criteria and the metrics
+of the course. It runs no code of the group: stand-ins for its laws and triggers ask walled processes what the robots do
+next, see `experiments.course.stand_ins`. It says its result by a pipe at its end: one that ends otherwise has not
+passed. However the marking ends, a guard ends these processes with it.
 """
 
 from __future__ import annotations
@@ -19,25 +19,27 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Final, NamedTuple, NoReturn
 
 import msgspec
 
 from agents.errors import ExplainedError
-from agents.plugins.calls import supervised
 from experiments.check.check import check
 from experiments.cores import cores
 from experiments.course.exercises import Course, CourseError, Exercise, write
+from experiments.course.stand_ins import company
 from experiments.file.document import load
 from experiments.file.problems import DocumentError
 from experiments.file.text import content
 from experiments.metrics.criteria import judge
+from experiments.metrics.metric import OF_LAW
+from experiments.metrics.results import CaseMetrics
 from experiments.report.verdict import criteria_met
 from experiments.run import simulate_seeds
 
 SOLUTION: Final = "(solution)"  # name of the course's own files among the groups
-CALL_S: Final = 2.0  # [s] longest call of a plug-in, see `supervised`
 LONGEST: Final = 1 << 20  # longest answer [bytes]
 MOST_FILES: Final = 1 << 16  # largest number of an open file
 FEW: Final = 3  # printed errors of a check
@@ -46,7 +48,7 @@ FEW: Final = 3  # printed errors of a check
 class Allowance(NamedTuple):
     """Allowance of the process that marks an exercise of a group."""
 
-    cpu_s: int = 60  # computing time [s]; twice that on the clock
+    cpu_s: int = 60  # computing time of each of its processes [s]; twice that on the clock for all
     memory: int = 1 << 30  # memory beside that of zenpark itself [bytes]
     file: int = 16 << 20  # largest file, and output [bytes]
 
@@ -103,8 +105,10 @@ def marks(
         groups: Folders with the files that were filled in.
 
     Raises:
-        CourseError: For a group that is no folder, or two of one name.
+        CourseError: For a group that is no folder, two of one name, and a criterion that a group could answer itself.
     """
+    for each in exercises:
+        _refuse_own_judges(each)
     if missing := next((folder for folder in groups if not folder.is_dir()), None):
         raise CourseError(f"{missing} is no folder; give one for each group")
     names = Counter([SOLUTION, *(folder.resolve().name for folder in groups)])
@@ -126,7 +130,7 @@ def marks(
                 while len(running) >= (cores()):
                     yield from _ended(running, answers, limits, guard)
                 place = Path(folder) / str(number)
-                pipe, process = _begun(work, partial(_mark, course, work, seeds, place), place, limits, guard)
+                pipe, process = _begun(work, partial(_mark, course, work, seeds, place, limits), place, limits, guard)
                 running[pipe] = process
                 answers.register(pipe, selectors.EVENT_READ)
             while running:
@@ -134,6 +138,18 @@ def marks(
         finally:
             for pipe, process in running.items():
                 _end(pipe, process, guard)
+
+
+def _refuse_own_judges(exercise: Exercise) -> None:
+    """Raises CourseError for an exercise with criteria that judge what the law of the group says of itself."""
+    for number, criterion in enumerate(exercise.posed.get("criteria", ()), 1) if exercise.laws else ():
+        metric = criterion.get("metric", OF_LAW)
+        if metric.startswith(OF_LAW) or metric.partition(":")[0] in exercise.laws:
+            said = criterion.get("measure", metric)
+            raise CourseError(
+                f"{exercise.file}: criterion {number} judges {said!r}, which the law of the group says of itself; "
+                "judge a metric of true places, from a file without blanks (docs/teaching.md)"
+            )
 
 
 @contextmanager
@@ -228,23 +244,28 @@ def _do(task: Callable[[], Mark], folder: Path, pipe: int, limits: Allowance, gu
         end(code)
 
 
-def _mark(course: Course, work: _Work, seeds: Sequence[int], folder: Path) -> Mark:
+def _mark(course: Course, work: _Work, seeds: Sequence[int], folder: Path, limits: Allowance) -> Mark:
     """Mark what a group handed in, in the process of its own."""
     exercise, texts = work.exercise, work.texts
+    solved, handed = folder / "course", folder / "group"
     try:
-        write({**course.files, **{name: texts[name] for name in exercise.laws if name in texts}}, folder)
+        write({**course.files, **{name: course.solved[name] for name in exercise.laws}}, solved)
+        write({name: texts.get(name, course.files[name]) for name in exercise.laws}, handed)
         changes = exercise.filled(texts[exercise.file], exercise.file) if exercise.file in texts else []
-        with supervised(CALL_S):
-            read = load(folder / exercise.file, *changes)
+        with company(exercise.classes, solved, handed, limits.cpu_s, limits.memory) as cells:
+            read = load(solved / exercise.file, *changes)
             if errors := [str(each) for each in check(read) if each.severity == "error"]:
-                return work.failed(*errors[:FEW])
-            cases = [case for run in simulate_seeds(read, seeds, processes=1) for case in run.metrics.values()]
+                return work.failed(*(each.replace(f"{solved}/", "") for each in errors[:FEW]))
+            cases = list[CaseMetrics]()
+            for case, seed in product(read.cases(), seeds):
+                cells.leave()
+                cases += simulate_seeds(read, [seed], cases=[case], processes=1)[0].metrics.values()
         met = [each.passed for each in judge(cases)].count(True)
         words = [line.text for line in criteria_met(cases) if line.mark == "bad"]
         return Mark(work.group, exercise.name, met, exercise.criteria, words[1:])
     except ExplainedError as error:
-        return work.failed(str(error).replace(f"{folder}/", ""))
-    except BaseException as error:  # noqa: BLE001 - whatever the code of a group raises
+        return work.failed(str(error).replace(f"{solved}/", ""))
+    except Exception as error:  # noqa: BLE001 - a metric of the course that meets what its author did not expect
         return work.failed(f"{type(error).__name__}: {error}")
 
 
@@ -264,7 +285,8 @@ def _ended(
         if time.monotonic() > process.until:
             answers.unregister(pipe)
             _end(pipe, running.pop(pipe), guard)
-            yield process.work.failed(f"took more than {2 * limits.cpu_s} s")
+            words = f"took more than {2 * limits.cpu_s} s, of which its law may compute {limits.cpu_s} s (--limit)"
+            yield process.work.failed(words)
 
 
 def _end(pipe: int, process: _Process, guard: int) -> int:

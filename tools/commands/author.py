@@ -146,12 +146,17 @@ def mark(
     from agents.errors import did_you_mean
     from experiments.course.exercises import OURS, CourseError, read_course
     from experiments.course.marking import DEFAULT, SOLUTION, marks
+    from experiments.course.wall import lacking
 
     known = read_course(origin or OURS)
     if stranger := next((name for name in only or [] if name not in known.exercises), None):
         raise CourseError(f"no exercise '{stranger}'; {did_you_mean(stranger, known.exercises)}")
     asked = {name: each for name, each in known.exercises.items() if not only or name in only}
     first = secrets.randbelow(1_000_000) if seed is None else seed
+    if missing := lacking():
+        say(
+            f"no wall around {' and '.join(missing)} on this system: what groups wrote could reach yours", to=sys.stderr
+        )
     found = []
     limits = DEFAULT._replace(cpu_s=limit)
     for each in marks(known, [*asked.values()], folders, range(first, first + seeds), limits):

@@ -2,12 +2,19 @@
 
 import json
 import signal
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
+import numpy as np
 import psutil
 import pytest
 
-from experiments.course.exercises import CourseError, posed, read_course, write, write_exercises
+from experiments.course.exercises import OURS, CourseError, posed, read_course, write, write_exercises
+from experiments.course.stand_ins import company
+from experiments.course.wall import lacking
+from experiments.file.document import load
+from experiments.run import simulate
 from tests.commands import GUARD, environment, invoke, started, zenpark
 from tests.waiting import until
 
@@ -57,22 +64,45 @@ class Apart(Metric, frozen=True):
         return np.ptp(trace.true_position[-1, :, 0])
 """
 LINE = "x = 0.2 * (each.position[0] - view.position[0])"
+KNOWING = "KNOWING = {'Plan', 'Course', 'Exercise', 'Company'}\n"  # names of what a law is not to find
 # What stands in the law instead of the solution, and words of its failure
 TROUBLES = {
-    "exits": ("sys.exit(0)", "the law Meet failed: SystemExit: 0 (meet.py:11)"),
-    "ends": ("os._exit(0)", "ends the process: os._exit(0) (meet.py:11)"),
-    "ends-late": ("view.time > 3.0 and os._exit(0)", "ends the process: os._exit(0) (meet.py:11)"),
-    "is-killed": ("os.kill(os.getpid(), 9)", "its process was ended by SIGKILL"),
-    "loops": ("\n            while True: pass", "took more than "),
+    "exits": ("sys.exit(0)", "the law Meet failed: SystemExit: 0 (meet.py:12)"),
+    "ends": ("os._exit(0)", "ends the process: os._exit(0) (meet.py:12)"),
+    "ends-late": ("view.time > 3.0 and os._exit(0)", "ends the process: os._exit(0) (meet.py:12)"),
+    "is-killed": ("os.kill(os.getpid(), 9)", "its process ended, by signal 9"),
+    "loops": ("\n            while True: pass", "took more than 2 s (meet.py:13); does a loop there never end?"),
     "computes": ("sum(range(10**12))", "took more than "),
-    "prints": ("print('x' * 10**8)", "File too large"),
-    "writes": ("open('big', 'wb').write(bytes(10**8))", "File too large"),
     "fills": ("bytearray(10**11)", "the law Meet failed: MemoryError"),
     "boasts": ('print(\'{"met": 1, "of": 1}\'); os._exit(0)', "ends the process"),
-    "raises": ("1 / 0", "the law Meet failed: ZeroDivisionError: division by zero (meet.py:11)"),
+    "raises": ("1 / 0", "the law Meet failed: ZeroDivisionError: division by zero (meet.py:12)"),
+    "unknown": ("x = float('nan')", "its law wants something that is not finite"),
+    "empty": ("return None", "must give a Control, not nothing: is a `return` missing?"),
+    "texts": ("x = 'far'", "must give three numbers as velocity or goal, not ['far', 0.0, nan]"),
     "stands": ("x = 0.0", "Apart [m] in default is 1.20 for 2 of 2 seeds"),
     "flees": ("x = view.position[0] - each.position[0]", "the law drives the robots apart"),
+    "answers": ("[os.write(n, bytes(8)) for n in range(3, 30) if os.path.exists(f'/dev/fd/{n}')]", "answers what"),
+    "patches": ("import experiments.metrics.criteria as c; c.judge = lambda cases: []", "Apart [m] in default is 1.20"),
+    "searches": ("import gc; raise ValueError({type(x).__name__ for x in gc.get_objects()} & KNOWING)", "Error: set()"),
+    "talks": ("KNOWING.add(view.robot.name); x = 0.2 * (len(KNOWING) > 5) * (each.position[0] - view.position[0])",
+              "Apart [m] in default is 1.20"),
+}  # fmt: skip
+# Likewise, of laws that meet a wall: how they try, in the folder of the course or on the process that marks
+REFUSED = {
+    "reads": "open('{course}/meet.py').read()", "deletes": "os.remove('{course}/places.py')",
+    "empties": "os.truncate('{course}/places.py', 0)", "hides": "os.chmod('{course}/places.py', 0)",
+    "writes": "open('mark.json', 'w').write('passed')", "shares": "open('/dev/shm/places', 'w')",
+    "looks": "open('/proc/%d/mem' % os.getppid(), 'r+b')", "kills": "os.kill(os.getppid(), 9)",
+    "forks": "os.fork()", "starts": "__import__('subprocess').run(['true'])", "leaves": "os.setsid()",
+    "calls": "__import__('socket').socket()",
+}  # fmt: skip
+HONEST = {
+    "computes": "import numpy; x = numpy.float64(0.2) * (numpy.array(each.position) - view.position)[0]",
+    "imports": f"import scipy.linalg; {LINE}",
+    "prints": f"print(each, file=sys.stderr); {LINE}",
+    "waits": f"import threading; it = threading.Thread(target=print); it.start(); it.join(); {LINE}",
 }
+walled = pytest.mark.skipif(bool(lacking()), reason=f"no wall around {' and '.join(lacking())} here")
 
 
 @pytest.fixture
@@ -108,22 +138,52 @@ def test_blanks_alone_are_taken(course):
     (exercise,) = read_course(course).exercises.values()
     mine = posed(FILE).replace("at_most = 0.9", "at_most = 9.0").replace("# a link", '"B - A" = "link"')
     assert exercise.filled(mine, "meet.toml") == ['"formation"."links"."B - A"="link"']
+    table = (("formation",),)
+    closed = replace(exercise, blanks=table, solved={"formation": exercise.posed["formation"] | {"gain": 2.0}})
+    given = posed(FILE).replace("[formation]", "[formation]\nstiffness = 9.0\ngain = 3.0")
+    assert closed.filled(given, "meet.toml") == ['"formation"."gain"=3.0']
     with pytest.raises(CourseError, match="give a number, a text, a list or a table"):
         exercise.filled(posed(FILE).replace("# a link", '"B - A" = 2026-01-01'), "meet.toml")
 
 
+def handed_in(groups: Path, lines: dict[str, str]) -> list[Path]:
+    """Folders of groups, each with a line in the place of the solution's."""
+    for name, instead in lines.items():
+        write({"meet.toml": FILE, "meet.py": KNOWING + LAW.replace(LINE, instead)}, groups / name)
+    return sorted(groups.iterdir())
+
+
 @pytest.mark.slow
 def test_trouble_is_no_pass(course, tmp_path):
-    groups = tmp_path / "groups"
-    for name, (instead, _) in TROUBLES.items():
-        write({"meet.toml": FILE, "meet.py": LAW.replace(LINE, instead)}, groups / name)
-    found, said = marked(course, *sorted(groups.iterdir()), "--limit", 5, code=1)
+    folders = handed_in(tmp_path / "groups", {name: instead for name, (instead, _) in TROUBLES.items()})
+    found, said = marked(course, *folders, "--limit", 20, code=1)
     assert found["(solution)"]["met"] == 1
     assert {name: each["met"] for name, each in found.items() if each["met"]} == {"(solution)": 1}
     for name, (_, words) in TROUBLES.items():
         assert words in " ".join(found[name]["words"]), name
         assert f"{name} meet: " in said
         assert str(tmp_path) not in " ".join(found[name]["words"])
+
+
+@walled
+@pytest.mark.slow
+def test_a_wall_stands_around_laws(course, tmp_path):
+    lines = {name: instead.replace("{course}", str(course)) for name, instead in REFUSED.items()}
+    found, said = marked(course, *handed_in(tmp_path / "groups", lines), code=1)
+    assert {name: each["met"] for name, each in found.items() if each["met"]} == {"(solution)": 1}
+    for name in REFUSED:
+        (words,) = found[name]["words"]
+        assert words.startswith("the law Meet failed: PermissionError: [Errno "), name
+        assert words.endswith("(meet.py:12)")
+    assert {file.name for file in course.iterdir()} == {"meet.toml", "meet.py", "places.py"}
+    assert all(file.stat().st_mode & 0o777 == 0o644 and file.stat().st_size > 0 for file in course.iterdir())
+    assert "could" not in said
+
+
+@pytest.mark.slow
+def test_honest_laws_pass(course, tmp_path):
+    found, _ = marked(course, *handed_in(tmp_path / "groups", HONEST), code=0)
+    assert {name for name, each in found.items() if each["met"]} == {"(solution)", *HONEST}
 
 
 @pytest.mark.slow
@@ -144,27 +204,113 @@ def test_groups_hand_in_what_they_like(course, tmp_path):
 
 
 def test_wrong_calls_are_refused(course, tmp_path):
+    says, own = tmp_path / "says", tmp_path / "own"
+    for folder, metric in ((says, 'measure = "far"'), (own, 'metric = "meet.py:Apart"')):
+        write({"meet.toml": FILE.replace('metric = "places.py:Apart"', metric), "meet.py": LAW + METRIC}, folder)
     for words, said in {
         (course / "none",): "none is no folder; give one for each group",
         (course, course): "two groups are named course; give their folders other names",
+        (tmp_path, "--from", says): "criterion 1 judges 'far', which the law of the group says of itself; judge a",
+        (tmp_path, "--from", own): "criterion 1 judges 'meet.py:Apart', which the law of the group",
         (course, "--only", "met"): "no exercise 'met'; did you mean 'meet'?",
     }.items():
-        assert said in str(invoke("mark", *words, "--from", course, code=1).exception)
+        origin = () if "--from" in words else ("--from", course)
+        assert said in str(invoke("mark", *words, *origin, code=1).exception)
     assert "holds no exercise" in str(invoke("course", tmp_path / "new", "--from", tmp_path, code=1).exception)
 
 
-FORKS = "(os.fork() or open('begun', 'x'), time.sleep(600))"  # a law that starts a child
+SLEEPS = "__import__('signal').pthread_sigmask(0, {14}); time.sleep(600)"  # a law that no alarm wakes
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL, signal.SIGINT])
 def test_marking_that_ends_leaves_no_process(course, tmp_path, number):
-    write({"meet.toml": FILE, "meet.py": LAW.replace(LINE, FORKS)}, tmp_path / "sleeps")
+    write({"meet.toml": FILE, "meet.py": LAW.replace(LINE, SLEEPS)}, tmp_path / "sleeps")
     words = ("mark", tmp_path / "sleeps", "--from", course, "--seeds", 1)
     with started(*GUARD, *words, env=environment(TMPDIR=str(tmp_path))) as marking:
-        until(lambda: list(tmp_path.glob("zenpark-mark-*/*/begun")), "the law sleeps")
-        processes = psutil.Process(marking.pid).children(recursive=True)
-        assert len(processes) >= 3  # guard, law and its child
+        below = partial(psutil.Process(marking.pid).children, recursive=True)
+        until(
+            lambda: any(each.status() == "sleeping" and each.parents()[2].pid == marking.pid for each in below()),
+            "a law sleeps",
+        )
+        processes = below()
+        assert len(processes) >= 4  # guard, judge, nursery, cell
         marking.send_signal(number)
         marking.wait()
         until(lambda: not any(map(psutil.Process.is_running, processes)), "all are gone")
+
+
+SQUARE = """
+title = "A square"
+duration_s = 6.0
+trigger = { kind = "square.py:Late", least = 0.02 }
+disturbance.all.position_sigma = 0.0005
+formation.law = "square.py:Pull"
+[robots.A]
+kind = "khepera4"
+start = [-0.5, 0.0]
+[robots.B]
+kind = "khepera4"
+start = [0.7, 0.1]
+[formation.links]
+"A - B" = 0.6
+[[criteria]]
+metric = "residual"
+at_most = 0.03
+[[criteria]]
+metric = "f_hz"
+at_most = 3.0
+"""
+PULL = """
+from zenpark import Gradient, Trigger
+
+class Pull(Gradient, frozen=True):
+    gain: float = 1.0
+
+    def pull(self, apart, link):
+        # blank: return (0.0, 0.0, 0.0)
+        far = sum(each * each for each in apart) - link.distance**2
+        return tuple(-0.5 * self.gain * far * each for each in apart)
+        # end of blank
+
+    def error(self, apart, link):
+        return abs(sum(each * each for each in apart) ** 0.5 - link.distance)
+
+class Late(Trigger, frozen=True):
+    MEMORY = {"asked": 0.0}
+    least: float
+
+    def fires(self, view):
+        view.memory.asked += 1.0
+        return view.deviation > self.least or view.memory.asked % 50.0 == 0.0
+"""
+
+
+def test_stand_ins_fly_as_the_law_itself(tmp_path):
+    """A law with memory and words, a gradient, and a trigger with a memory: the same flight, to the last bit."""
+    write({"square.toml": SQUARE, "square.py": PULL}, tmp_path)
+    leader = OURS / "06-leader.toml"
+    for file, classes in (
+        (leader, ["06_leader.py:Follow"]),
+        (tmp_path / "square.toml", ["square.py:Pull", "square.py:Late"]),
+    ):
+        alone = simulate(load(file), seed=3)
+        with company(classes, file.parent, file.parent, 20, 1 << 30) as cells:
+            flown = simulate(load(file), seed=3)
+            assert len(cells.processes) >= 3
+        (one,), (other,) = alone.traces.values(), flown.traces.values()
+        assert np.array_equal(one.true_position, other.true_position)
+        assert alone.metrics == flown.metrics
+
+
+@pytest.mark.slow
+def test_errors_are_computed_by_the_course(tmp_path):
+    """A group whose law denies its errors, or whose trigger pretends, has not passed."""
+    course = tmp_path / "course"
+    write({"square.toml": SQUARE, "square.py": PULL}, course)
+    lies = posed(PULL).replace("return abs(", "return 0.0 * abs(")
+    talks = PULL.replace("return view.deviation > self.least", "return True")
+    for name, text in (("lies", lies), ("talks", talks), ("right", PULL)):
+        write({"square.toml": SQUARE, "square.py": text}, tmp_path / name)
+    found, _ = marked(course, *(tmp_path / name for name in ("lies", "talks", "right")), code=1)
+    assert {name: each["met"] for name, each in found.items()} == {"(solution)": 2, "right": 2, "lies": 1, "talks": 1}
