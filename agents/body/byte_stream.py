@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from typing import Any, Final
 
 WORD: Final = struct.Struct("<I")
+Packet = tuple[int, bytes]  # last value of the head, and body
 
 
 class MalformedStream(ValueError):
@@ -48,3 +50,28 @@ class Cursor:
         text = self.data[self.at : end].decode(errors="replace")
         self.at = end + 1
         return text
+
+
+class Framer:
+    """Cuts a stream of bytes into packets of a head and a body."""
+
+    def __init__(self, head: struct.Struct, length: Callable[..., int]) -> None:
+        """Take the layout of heads, and the length of a body by the values of its head; raises MalformedStream there."""
+        self._head, self._length = head, length
+        self._waiting = bytearray()
+
+    def feed(self, received: bytes) -> list[Packet]:
+        """Last value of the head, and body, of the packets that are complete now, oldest first."""
+        waiting = self._waiting
+        waiting += received
+        found, at = list[Packet](), 0
+        while len(waiting) - at >= self._head.size:
+            values = self._head.unpack_from(waiting, at)
+            begin = at + self._head.size
+            end = begin + self._length(*values)
+            if end > len(waiting):
+                break
+            found.append((values[-1], bytes(waiting[begin:end])))
+            at = end
+        del waiting[:at]
+        return found

@@ -11,9 +11,12 @@ import select
 import socket
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Final, NamedTuple
+
+from agents.body.byte_stream import Framer, MalformedStream, Packet
 
 CHUNK: Final = 1 << 18  # [bytes] read at once: about ten frames of twenty bodies
 SKEW: Final = 1e-3  # tolerance of a rotation's orthonormality, and of a quaternion's square
@@ -103,15 +106,7 @@ def readable(sockets: Sequence[socket.socket], deadline: float) -> bool:
     return bool(waiting.poll(1000.0 * max(0.0, deadline - time.monotonic())))
 
 
-def connect_tcp(host: str, port: int, timeout_s: float) -> socket.socket:
-    """Connection over TCP that never blocks and delays no packet; raises OSError if there is none in time [s]."""
-    connection = socket.create_connection((host, port), timeout_s)
-    connection.setblocking(False)
-    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    return connection
-
-
-def received(connection: socket.socket) -> bytes:
+def _received(connection: socket.socket) -> bytes:
     """Bytes that a TCP connection has received, empty if that is nothing; raises OSError where it is closed."""
     parts: list[bytes] = []
     while True:
@@ -124,6 +119,53 @@ def received(connection: socket.socket) -> bytes:
         if not part:
             return b"".join(parts)
         parts.append(part)
+
+
+class PacketReader(CaptureReader):
+    """Reader of packets over one TCP connection."""
+
+    def __init__(self, host: str, port: int, timeout_s: float, framer: Framer) -> None:
+        """Connect; raises OSError if no server answers in time [s], and MalformedStream if it is another one."""
+        deadline = time.monotonic() + timeout_s
+        self._framer = framer
+        self._packets: deque[Packet] = deque()  # packets received, not decoded yet
+        self._socket = socket.create_connection((host, port), timeout_s)
+        self._socket.setblocking(False)
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        try:
+            self._subscribe(deadline)
+        except (OSError, MalformedStream):
+            self._socket.close()
+            raise
+
+    @abstractmethod
+    def _subscribe(self, deadline: float) -> None:
+        """Ask the server for frames."""
+
+    @abstractmethod
+    def _decoded(self, packets: Iterable[Packet]) -> CaptureFrame | None:
+        """The newest frame in packets."""
+
+    def newest(self, timeout_s: float) -> CaptureFrame | None:
+        deadline = time.monotonic() + timeout_s
+        while True:
+            self._packets += self._framer.feed(_received(self._socket))
+            packets, self._packets = self._packets, deque()
+            if (frame := self._decoded(packets)) is not None:
+                return frame
+            if not readable([self._socket], deadline):
+                return None
+
+    def _next_packet(self, deadline: float) -> Packet:
+        """The next packet; raises TimeoutError without one."""
+        while not self._packets:
+            if not readable([self._socket], deadline):
+                raise TimeoutError("no answer")
+            self._packets += self._framer.feed(_received(self._socket))
+        return self._packets.popleft()
+
+    def close(self) -> None:
+        self._socket.close()
 
 
 def rotation_of(quaternion: Sequence[float]) -> tuple[float, ...]:

@@ -6,22 +6,13 @@ The vendor's own client blocks the interpreter while it connects, and never retu
 from __future__ import annotations
 
 import math
-import time
-from collections import deque
+from collections.abc import Iterable
 from typing import ClassVar
 
-from agents.body.byte_stream import MalformedStream
-from agents.body.capture_reader import (
-    CaptureFrame,
-    CaptureReader,
-    MeasuredPose,
-    by_name,
-    connect_tcp,
-    readable,
-    received,
-)
+from agents.body.byte_stream import MalformedStream, Packet
+from agents.body.capture_reader import CaptureFrame, MeasuredPose, PacketReader, by_name
 from bridges.motion_capture.protocol import vicon_datastream
-from bridges.motion_capture.protocol.vicon_datastream import BlockKind, Framer, Segment, Subject
+from bridges.motion_capture.protocol.vicon_datastream import BlockKind, Segment, Subject
 
 
 class Decoder:
@@ -68,7 +59,7 @@ class Decoder:
         return CaptureFrame(number, poses, latency if latency >= 0.0 else math.nan, self._up, clock)
 
 
-class ViconReader(CaptureReader):
+class ViconReader(PacketReader):
     """Connection to a DataStream server, that of Tracker or Nexus."""
 
     PORT: ClassVar = vicon_datastream.PORT
@@ -76,41 +67,23 @@ class ViconReader(CaptureReader):
     TWIN: ClassVar = "bridges.motion_capture.twin.vicon:ViconTwin"
 
     def __init__(self, host: str, port: int = vicon_datastream.PORT, timeout_s: float = 2.0) -> None:
-        deadline = time.monotonic() + timeout_s
-        self._framer, self._decoder = Framer(), Decoder()
-        self._waiting: deque[bytes] = deque()  # packets received, not decoded yet
-        self._socket = connect_tcp(host, port, timeout_s)
-        try:
-            offered = self._offered_streams(deadline)
-            if BlockKind.GLOBAL_SEGMENTS not in offered:
-                raise MalformedStream("the server has no segments to offer")
-            wanted = offered.intersection(vicon_datastream.POSES)
-            stream = vicon_datastream.packet(vicon_datastream.block(BlockKind.REQUEST_FRAME, b"\x01"))
-            self._socket.sendall(vicon_datastream.pack_kinds(wanted) + stream)
-        except (OSError, MalformedStream):
-            self._socket.close()
-            raise
+        self._decoder = Decoder()
+        super().__init__(host, port, timeout_s, vicon_datastream.framer())
 
-    def newest(self, timeout_s: float) -> CaptureFrame | None:
-        deadline = time.monotonic() + timeout_s
-        while True:
-            self._waiting += self._framer.feed(received(self._socket))
-            bodies, self._waiting = self._waiting, deque()
-            frames = [frame for body in bodies if (frame := self._decoder.frame(body)) is not None]
-            if frames:
-                return max(frames, key=lambda frame: frame.number)
-            if not readable([self._socket], deadline):
-                return None
+    def _subscribe(self, deadline: float) -> None:
+        offered = self._offered_streams(deadline)
+        if BlockKind.GLOBAL_SEGMENTS not in offered:
+            raise MalformedStream("the server has no segments to offer")
+        wanted = offered.intersection(vicon_datastream.POSES)
+        stream = vicon_datastream.packet(vicon_datastream.block(BlockKind.REQUEST_FRAME, b"\x01"))
+        self._socket.sendall(vicon_datastream.pack_kinds(wanted) + stream)
 
-    def close(self) -> None:
-        self._socket.close()
+    def _decoded(self, packets: Iterable[Packet]) -> CaptureFrame | None:
+        frames = [frame for _, body in packets if (frame := self._decoder.frame(body)) is not None]
+        return max(frames, key=lambda frame: frame.number, default=None)
 
     def _offered_streams(self, deadline: float) -> set[int]:
         while True:
-            if not readable([self._socket], deadline):
-                raise TimeoutError("no answer")
-            self._waiting += self._framer.feed(received(self._socket))
-            while self._waiting:
-                for kind, payload in vicon_datastream.blocks(self._waiting.popleft()):
-                    if kind == BlockKind.OBJECT_ENUMS:
-                        return vicon_datastream.unpack_kinds(payload)
+            for kind, payload in vicon_datastream.blocks(self._next_packet(deadline)[1]):
+                if kind == BlockKind.OBJECT_ENUMS:
+                    return vicon_datastream.unpack_kinds(payload)

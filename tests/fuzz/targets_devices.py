@@ -22,10 +22,10 @@ from bridges.khepera4.twin import KheperaDevice
 from bridges.motion_capture.protocol import natnet, qtm
 from bridges.motion_capture.protocol import vicon_datastream as vicon
 from bridges.motion_capture.protocol.natnet import MessageKind, NatNetFrame, RigidBodyPose, ServerInfo
-from bridges.motion_capture.protocol.qtm import BodyPose, PacketFramer, QtmFrame, QtmPacketKind
+from bridges.motion_capture.protocol.qtm import BodyPose, QtmFrame, QtmPacketKind
 from bridges.motion_capture.protocol.vicon_datastream import BlockKind, Segment
 from bridges.motion_capture.publisher import PoseFilter
-from bridges.motion_capture.twin.vicon import ViconClient, ViconTwin
+from bridges.motion_capture.twin.vicon import ViconTwin
 from bridges.motion_capture.vicon import Decoder
 from bridges.tello.pilot import TelloPilot
 from bridges.tello.protocol import TelloSettings
@@ -134,9 +134,9 @@ def vicon_bridge():
     decoder, pose_filter = Decoder(), PoseFilter({"CF01": "cf1", "KH01": "kh1"}, lambda _: None)
     for k in count(1):
         data = yield
-        framer = vicon.Framer()  # the connection is made anew after every error
+        framer = vicon.framer()  # the connection is made anew after every error
         for begin in range(0, len(data), 4000):
-            for body in framer.feed(data[begin : begin + 4000]):
+            for _, body in framer.feed(data[begin : begin + 4000]):
                 for kind, payload in vicon.blocks(body):
                     if kind == BlockKind.OBJECT_ENUMS:
                         vicon.unpack_kinds(payload)
@@ -182,7 +182,7 @@ def qtm_packets():
     names = qtm.command(qtm.pack_parameters(["cf1", "kh1"], 100.0), QtmPacketKind.XML)
 
     def take(data):
-        for kind, payload in PacketFramer().feed(data):
+        for kind, payload in qtm.framer().feed(data):
             if kind == QtmPacketKind.XML:
                 qtm.unpack_parameters(payload)
             elif kind == QtmPacketKind.DATA:
@@ -200,7 +200,7 @@ def vicon_twin():
 
     def take(data):
         t, wire = 0.01 * next(ticks), Wire()
-        twin.clients = {wire: ViconClient()}
+        twin.clients = {wire: twin.new_client()}
         wire.waiting += [data[:3000], data[3000:]] if len(data) > 3000 else [data]
         while wire.waiting and wire in twin.clients:
             twin.serve(wire, t)

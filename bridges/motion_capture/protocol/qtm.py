@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 from xml.etree import ElementTree
 from xml.sax.saxutils import escape
 
-from agents.body.byte_stream import Cursor, MalformedStream
+from agents.body.byte_stream import Cursor, Framer, MalformedStream
 
 PORT: Final = 22223  # port for little endian; 22222 has another protocol
 VERSION: Final = "1.12"  # 6DOF bodies are the same in all later ones
@@ -74,29 +74,15 @@ def command(text: bytes, kind: QtmPacketKind = QtmPacketKind.COMMAND) -> bytes:
     return packet(kind, text + b"\0")
 
 
-class PacketFramer:
-    """Cuts a stream of bytes into packets."""
+def framer() -> Framer:
+    """A framer of packets, each with its kind."""
+    return Framer(_HEAD, _length)
 
-    def __init__(self) -> None:
-        self._waiting = bytearray()
 
-    def feed(self, received: bytes) -> list[tuple[int, bytes]]:
-        """Kind and payload of the packets that are complete now, oldest first."""
-        waiting = self._waiting
-        waiting += received
-        found, at = [], 0
-        while len(waiting) - at >= _HEAD.size:
-            size, kind = _HEAD.unpack_from(waiting, at)
-            if not _HEAD.size <= size <= MAX_PACKET or kind > 30:
-                raise MalformedStream(
-                    f"a packet of {size} bytes of the kind {kind}: is this QTM's port for little endian?"
-                )
-            if at + size > len(waiting):
-                break
-            found.append((kind, bytes(waiting[at + _HEAD.size : at + size])))
-            at += size
-        del waiting[:at]
-        return found
+def _length(size: int, kind: int) -> int:
+    if not _HEAD.size <= size <= MAX_PACKET or kind > 30:
+        raise MalformedStream(f"a packet of {size} bytes of the kind {kind}: is this QTM's port for little endian?")
+    return size - _HEAD.size
 
 
 def pack_frame(frame: QtmFrame) -> bytes:

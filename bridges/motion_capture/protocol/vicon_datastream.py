@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator
 from enum import IntEnum
 from typing import Final, NamedTuple
 
-from agents.body.byte_stream import MalformedStream
+from agents.body.byte_stream import Framer, MalformedStream
 
 PORT: Final = 801
 MAGIC: Final = 0x1A2B0001
@@ -129,30 +129,17 @@ def pack_segments(subject: int, segments: Iterable[Segment]) -> bytes:
 # ---------------------------------------------------------------------- unpacking
 
 
-class Framer:
-    """Cuts a stream of bytes into packets."""
+def framer() -> Framer:
+    """A framer of packets."""
+    return Framer(_HEAD, _length)
 
-    def __init__(self) -> None:
-        self._waiting = bytearray()
 
-    def feed(self, received: bytes) -> list[bytes]:
-        """The bodies of the packets that are complete now, oldest first."""
-        waiting = self._waiting
-        waiting += received
-        bodies, at = [], 0
-        while len(waiting) - at >= _HEAD.size:
-            magic, length = _HEAD.unpack_from(waiting, at)
-            if magic != MAGIC:
-                raise MalformedStream(f"a packet begins with {magic:#010x}, not with {MAGIC:#010x}")
-            if length > MAX_PACKET:
-                raise MalformedStream(f"a packet of {length} bytes is longer than any frame")
-            end = at + _HEAD.size + length
-            if end > len(waiting):
-                break
-            bodies.append(bytes(waiting[at + _HEAD.size : end]))
-            at = end
-        del waiting[:at]
-        return bodies
+def _length(magic: int, length: int) -> int:
+    if magic != MAGIC:
+        raise MalformedStream(f"a packet begins with {magic:#010x}, not with {MAGIC:#010x}")
+    if length > MAX_PACKET:
+        raise MalformedStream(f"a packet of {length} bytes is longer than any frame")
+    return length
 
 
 def blocks(body: bytes) -> Iterator[tuple[int, bytes]]:

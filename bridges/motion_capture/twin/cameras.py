@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final, cast
 
@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.body.byte_stream import MalformedStream
+from agents.body.byte_stream import Framer, MalformedStream, Packet
 from bridges.motion_capture.cameras import file as files
 from bridges.motion_capture.cameras.vision import FAMILY, FLAT, CameraModel, placed, square
 from bridges.motion_capture.twin.capture import CaptureClient, SeenBody, StreamTwin
@@ -121,12 +121,20 @@ class CameraImages:
         return top, bottom, left, right
 
 
-@dataclass(eq=False)
-class ImageClient(CaptureClient):
-    """Connection of a client, and the camera that it looks through."""
+class RequestFramer(Framer):
+    """Waits for the end of a request of HTTP."""
 
-    request: bytearray = field(default_factory=bytearray)
-    camera: str = ""
+    def __init__(self) -> None:
+        self._waiting = bytearray()
+
+    def feed(self, received: bytes) -> list[Packet]:
+        self._waiting += received
+        if b"\r\n\r\n" in self._waiting:
+            request, self._waiting = bytes(self._waiting), bytearray()
+            return [(0, request)]
+        if len(self._waiting) > 1 << 16:
+            raise MalformedStream("no request of HTTP")
+        return []
 
 
 class CamerasTwin(StreamTwin):
@@ -134,6 +142,8 @@ class CamerasTwin(StreamTwin):
 
     A body that is not tracked has no tag in the images; one that is frozen is in images that repeat themselves.
     """
+
+    framer = RequestFramer
 
     def __init__(self, bodies: Sequence[str], *, file: str, **settings: Any) -> None:  # noqa: ANN401 - as of the base
         """Settings as of `CaptureTwin`; raises ValueError for a file that lacks a body, or the place of a camera."""
@@ -155,23 +165,15 @@ class CamerasTwin(StreamTwin):
         super()._listen(host, port)
         self.address = f"{self._file}@{self.address}"
 
-    def _greeted(self) -> CaptureClient:
-        return ImageClient()
-
-    def _answer(self, client: CaptureClient, received: bytes) -> None:
-        assert isinstance(client, ImageClient)
-        client.request += received
-        if client.streams or b"\r\n\r\n" not in client.request:
-            if len(client.request) > 1 << 16:
-                raise MalformedStream("no request of HTTP")
+    def _answer(self, client: CaptureClient, kind: int, payload: bytes) -> None:
+        if client.streams:
             return
-        client.camera = client.request.split(b" ")[1].decode("latin-1").strip("/") if b" " in client.request else ""
+        client.camera = payload.split(b" ")[1].decode("latin-1").strip("/") if b" " in payload else ""
         client.streams = client.camera in self._images
         status = "200 OK" if client.streams else "404 Not Found"
         client.unsent += f"HTTP/1.0 {status}\r\nContent-Type: multipart/x-mixed-replace;boundary=image\r\n\r\n".encode()
 
     def _packet(self, client: CaptureClient, frame: bytes) -> bytes:
-        assert isinstance(client, ImageClient)
         try:
             exposed, images = msgspec.msgpack.decode(frame, type=tuple[float, dict[str, bytes]])
             image = images[client.camera]

@@ -10,17 +10,17 @@ import pkgutil
 import socket
 import threading
 from abc import abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, ClassVar, Final, Literal
 
 import msgspec
 import numpy as np
 import zenoh
 from msgspec import Meta
 
-from agents.body.byte_stream import MalformedStream
+from agents.body.byte_stream import Framer, MalformedStream
 from agents.body.coordinates import Coordinates
 from agents.clock import Clock, uptime
 from agents.network import messages, pubsub, validation
@@ -189,15 +189,19 @@ class CaptureTwin(Server):
 class CaptureClient:
     """Connection of a client over TCP."""
 
-    unsent: bytearray = field(default_factory=bytearray)
+    framer: Framer
+    unsent: bytearray
     streams: bool = False
     asked: int = 0  # single frames requested
     named: bool = False  # names of the bodies were sent
+    camera: str = ""  # name of the camera of which it gets the images
 
 
 class StreamTwin(CaptureTwin):
     """Motion capture over TCP."""
 
+    WELCOME: ClassVar = b""  # first bytes to a client
+    framer: ClassVar[Callable[[], Framer]]  # framer of the packets of a client
     clients: dict[socket.socket, CaptureClient]
 
     def _listen(self, host: str, port: int) -> None:
@@ -226,12 +230,8 @@ class StreamTwin(CaptureTwin):
         self.clients.clear()
 
     @abstractmethod
-    def _greeted(self) -> CaptureClient:
-        """A new client, with what it is sent first."""
-
-    @abstractmethod
-    def _answer(self, client: CaptureClient, received: bytes) -> None:
-        """Take in what a client has sent; raises MalformedStream for what the protocol has not."""
+    def _answer(self, client: CaptureClient, kind: int, payload: bytes) -> None:
+        """Take in a packet of a client; raises MalformedStream for what the protocol has not."""
 
     @abstractmethod
     def _packet(self, client: CaptureClient, frame: bytes) -> bytes:
@@ -241,6 +241,10 @@ class StreamTwin(CaptureTwin):
         for client in self.clients.values():
             client.named = False
 
+    def new_client(self) -> CaptureClient:
+        """A client that has just connected."""
+        return CaptureClient(type(self).framer(), bytearray(self.WELCOME))
+
     def _accept(self) -> None:
         try:
             connection, _ = self._listener.accept()
@@ -249,7 +253,7 @@ class StreamTwin(CaptureTwin):
         connection.setblocking(False)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BACKLOG)
-        self.clients[connection] = self._greeted()
+        self.clients[connection] = self.new_client()
         self._flush(connection, self.clients[connection])
 
     def _receive(self, connection: socket.socket, t: float) -> None:
@@ -259,7 +263,8 @@ class StreamTwin(CaptureTwin):
             if not received:
                 raise ConnectionResetError
             if not self.link.silent(t):
-                self._answer(client, received)
+                for kind, payload in client.framer.feed(received):
+                    self._answer(client, kind, payload)
         except BlockingIOError:
             return
         except (OSError, MalformedStream):

@@ -3,35 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from math import nan
 from typing import Final
 
 from bridges.motion_capture.protocol import qtm
-from bridges.motion_capture.protocol.qtm import BodyPose, PacketFramer, QtmFrame, QtmPacketKind
+from bridges.motion_capture.protocol.qtm import BodyPose, QtmFrame, QtmPacketKind
 from bridges.motion_capture.twin.capture import CaptureClient, SeenBody, StreamTwin
 
 OLD: Final = (b"1.0", b"1.1", b"1.2", b"1.3", b"1.4", b"1.5", b"1.6", b"1.7")  # versions with bodies of doubles
 
 
-@dataclass(eq=False)
-class QualisysClient(CaptureClient):
-    """Connection of a client."""
-
-    framer: PacketFramer = field(default_factory=PacketFramer)
-
-
 class QualisysTwin(StreamTwin):
     """Real-time server of QTM: 6DOF bodies over TCP. A body that is not tracked is NaN; a missing one is left out."""
 
-    def _greeted(self) -> CaptureClient:
-        return QualisysClient(unsent=bytearray(qtm.command(qtm.WELCOME)))
+    WELCOME = qtm.command(qtm.WELCOME)
+    framer = staticmethod(qtm.framer)
 
-    def _answer(self, client: CaptureClient, received: bytes) -> None:
-        assert isinstance(client, QualisysClient)
-        for kind, payload in client.framer.feed(received):
-            if kind == QtmPacketKind.COMMAND:
-                client.unsent += self._reply(client, payload.rstrip(b"\0").lower())
+    def _answer(self, client: CaptureClient, kind: int, payload: bytes) -> None:
+        if kind == QtmPacketKind.COMMAND:
+            client.unsent += self._reply(client, payload.rstrip(b"\0").lower())
 
     def _reply(self, client: CaptureClient, command: bytes) -> bytes:
         word, _, argument = command.partition(b" ")

@@ -3,35 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 from bridges.motion_capture.protocol import vicon_datastream
-from bridges.motion_capture.protocol.vicon_datastream import BlockKind, Framer, Segment
+from bridges.motion_capture.protocol.vicon_datastream import BlockKind, Segment
 from bridges.motion_capture.twin.capture import CaptureClient, SeenBody, StreamTwin
-
-
-@dataclass(eq=False)
-class ViconClient(CaptureClient):
-    """Connection of a client."""
-
-    framer: Framer = field(default_factory=Framer)
 
 
 class ViconTwin(StreamTwin):
     """DataStream server. A body that is not tracked has no segments."""
 
-    def _greeted(self) -> CaptureClient:
-        return ViconClient(unsent=bytearray(vicon_datastream.pack_kinds(vicon_datastream.POSES)))
+    WELCOME = vicon_datastream.pack_kinds(vicon_datastream.POSES)
+    framer = staticmethod(vicon_datastream.framer)
 
-    def _answer(self, client: CaptureClient, received: bytes) -> None:
-        assert isinstance(client, ViconClient)
-        for body in client.framer.feed(received):
-            for kind, payload in vicon_datastream.blocks(body):
-                if kind == BlockKind.REQUEST_FRAME:
-                    client.streams = payload[:1] == b"\x01"
-                    client.asked += not client.streams
-                elif kind == BlockKind.REQUEST_NEXT_FRAME:
-                    client.asked += 1
+    def _answer(self, client: CaptureClient, kind: int, payload: bytes) -> None:
+        for block, content in vicon_datastream.blocks(payload):
+            if block == BlockKind.REQUEST_FRAME:
+                client.streams = content[:1] == b"\x01"
+                client.asked += not client.streams
+            elif block == BlockKind.REQUEST_NEXT_FRAME:
+                client.asked += 1
 
     def _packet(self, client: CaptureClient, frame: bytes) -> bytes:
         """The packet of a frame, with names and axes for a client that has none."""

@@ -3,6 +3,7 @@
 import re
 import threading
 from contextlib import contextmanager
+from dataclasses import replace
 from math import atan2, cos, hypot, inf, sin
 
 import cv2
@@ -20,7 +21,7 @@ from bridges.motion_capture.cameras.reader import CamerasReader
 from bridges.motion_capture.cameras.tracker import Tracker
 from bridges.motion_capture.cameras.vision import FLAT, CameraModel, TagDetector, in_space, on_floor, square
 from bridges.motion_capture.publisher import PoseFilter
-from bridges.motion_capture.twin.cameras import CamerasTwin, ImageClient, Sheet, jpeg
+from bridges.motion_capture.twin.cameras import CamerasTwin, Sheet, jpeg
 from bridges.motion_capture.twin.capture import upright
 from tests.bridges.motion_capture.cameras_lab import CORNERS, FLOOR, Room, hung, moved, text
 from tests.bridges.motion_capture.test_systems import ALL, BEGIN, FAULTS, LASTS, fault
@@ -327,7 +328,7 @@ class Line:
         seen = file.parse(lines)
         self.twin = CamerasTwin(["cf_1", "kh"], file=str(folder / "cameras.toml"), faults=Faults(**faults))
         self.twin._flush = lambda *_: None
-        self.twin.clients = {name: ImageClient(streams=True, camera=name) for name in seen.cameras}
+        self.twin.clients = {name: replace(self.twin.new_client(), streams=True, camera=name) for name in seen.cameras}
         self.said, self.published = [], []
         self.tracker = Tracker(seen, self.said.append)
         self.filter = PoseFilter({"CF01": "cf_1", "KH01": "kh"}, self.said.append)

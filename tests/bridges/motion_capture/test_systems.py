@@ -292,7 +292,7 @@ def test_natnet_names_are_unpacked_as_packed(names, version):
 @given(st.lists(st.builds(BodyPose, triples, st.tuples(*[finite] * 9)), max_size=4), st.integers(1, 40))
 def test_qtm_frames_are_unpacked_however_cut(bodies, cut):
     stream = qtm.pack_frame(QtmFrame(1.25, 7, bodies)) + qtm.command(b"text")
-    framer = qtm.PacketFramer()
+    framer = qtm.framer()
     (_, payload), text = [each for at in range(0, len(stream), cut) for each in framer.feed(stream[at : at + cut])]
     frame = qtm.unpack_frame(payload)
     assert (frame.time_s, frame.number, text) == (1.25, 7, (qtm.QtmPacketKind.COMMAND, b"text\0"))

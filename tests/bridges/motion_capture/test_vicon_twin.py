@@ -21,7 +21,7 @@ from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
 from bridges.motion_capture.protocol import vicon_datastream
-from bridges.motion_capture.protocol.vicon_datastream import BlockKind, Framer, Segment
+from bridges.motion_capture.protocol.vicon_datastream import BlockKind, Segment
 from bridges.motion_capture.twin.capture import upright
 from bridges.motion_capture.twin.vicon import ViconTwin
 from bridges.motion_capture.vicon import Decoder, ViconReader
@@ -65,8 +65,8 @@ def test_packed_frames_are_unpacked_however_they_are_cut(bodies, number, cut):
         vicon_datastream.pack_latency([("a", 0.25), ("b", 1.125)]),
         *(vicon_datastream.pack_segments(row, [segment]) for row, segment in enumerate(sent)),
     )
-    framer, decoder = Framer(), Decoder()
-    packets = [body for at in range(0, 2 * len(stream), cut) for body in framer.feed((stream * 2)[at : at + cut])]
+    framer, decoder = vicon_datastream.framer(), Decoder()
+    packets = [body for at in range(0, 2 * len(stream), cut) for _, body in framer.feed((stream * 2)[at : at + cut])]
     assert len(packets) == 2
     for body in packets:
         frame = decoder.frame(body)
@@ -137,7 +137,7 @@ class Viewer:
     def __init__(self, twin):
         self.twin = twin
         self.client = socket.create_connection(("127.0.0.1", int(self.twin.address.rpartition(":")[2])), 2.0)
-        self.framer, self.decoder, self.close = Framer(), Decoder(), self.client.close
+        self.framer, self.decoder, self.close = vicon_datastream.framer(), Decoder(), self.client.close
         self.serve()
         self.ask(BlockKind.REQUEST_FRAME, b"\x01")
         assert self.client.recv(65536) == vicon_datastream.pack_kinds(vicon_datastream.POSES)
@@ -155,7 +155,7 @@ class Viewer:
         self.twin.advance(t)
         if not select.select([self.client], [], [], 0.02)[0]:
             return []
-        return [self.decoder.frame(body) for body in self.framer.feed(self.client.recv(65536))]
+        return [self.decoder.frame(body) for _, body in self.framer.feed(self.client.recv(65536))]
 
 
 def test_delayed_frame_comes_late_but_unchanged():
