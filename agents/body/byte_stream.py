@@ -56,7 +56,7 @@ class Framer:
     """Cuts a stream of bytes into packets of a head and a body."""
 
     def __init__(self, head: struct.Struct, length: Callable[..., int]) -> None:
-        """Take the layout of heads, and the length of a body by the values of its head; raises MalformedStream there."""
+        """Take the layout of a head, and the length of its body by its values, which may raise MalformedStream."""
         self._head, self._length = head, length
         self._waiting = bytearray()
 

@@ -14,7 +14,7 @@ from experiments.metrics.statistics import first_seed
 from experiments.recording.trace import Trace
 from experiments.report.page import template
 from experiments.scene.models import ROUND, circle
-from experiments.scene.stage import FAIR_M, GOOD_M, SceneModel, drawn_errors, link_levels
+from experiments.scene.stage import FAIR_M, GOOD_M, SceneModel, link_levels, with_bare_links
 from twins.arrays import Array
 
 CASES: Final = 2  # side by side
@@ -78,7 +78,7 @@ def _case(trace: Trace, step: float) -> dict[str, Any]:
     at = np.clip(np.searchsorted(trace.time, grid - 1e-9), 0, len(trace.time) - 1)
     place = trace.true_position[at]
     rows = np.concatenate([place, np.nan_to_num(trace.yaw[at])[..., None]], axis=2)
-    level = link_levels(drawn_errors(trace.plan, grid, place, Measurement.of(trace).errors.error[at]))
+    level = link_levels(with_bare_links(trace.plan, grid, place, Measurement.of(trace).errors.error[at]))
     poses = np.stack([stage.scene.at(float(t)) for t in grid]).reshape(len(grid), -1)
     return {
         "name": trace.case,

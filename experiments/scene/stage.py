@@ -23,7 +23,7 @@ from agents.network.messages import Ranges, State, Status, WorldState
 from agents.plugins import registry
 from experiments.arrays import known_rows
 from experiments.definition.experiment import WORLD
-from experiments.definition.formation import errors_over_time, targeted
+from experiments.definition.formation import targeted
 from experiments.definition.graph import Links, links
 from experiments.definition.plan import Plan, finds_contacts
 from experiments.metrics.clearance import Overlap, present_overlaps
@@ -319,17 +319,15 @@ class LinkTracker:
         return np.where(receives, sums_of_errors(self._stage, error), np.nan)
 
 
-def drawn_errors(plan: Plan, time: Array, position: Array, error: Array | None = None) -> Array:
+def with_bare_links(plan: Plan, time: Array, position: Array, error: Array) -> Array:
     """Errors of links (T, E) [m] as `LinkTracker` gives them, along true positions (T, N, 3) at times (T,).
 
     Args:
-        error: Result of `errors_over_time`, if it is known already.
+        error: As `errors_over_time` gives them.
     """
-    pattern = plan.formation
-    error = errors_over_time(plan.law, pattern, time, position) if error is None else error
-    present = pattern.present(time, position)
-    bare = ~targeted(plan.law, pattern) if present is None else present & ~targeted(plan.law, pattern)
-    return np.where(bare, BARE, error)
+    present = plan.formation.present(time, position)
+    bare = ~targeted(plan.law, plan.formation)
+    return np.where(bare if present is None else present & bare, BARE, error)
 
 
 def sums_of_errors(stage: SceneModel, error: Array) -> Array:

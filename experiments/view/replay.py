@@ -13,12 +13,13 @@ import numpy as np
 
 from agents.decision.lifecycle import Phase
 from agents.network.messages import Contact, Status, WorldState
+from experiments.definition.formation import errors_over_time
 from experiments.metrics.clearance import Overlap
 from experiments.recording.playback import WholeRecording
 from experiments.recording.trace import ROUNDING_S
 from experiments.scene.condition import AT_REST, Condition, RobotRow, condition
 from experiments.scene.drawing import SceneDrawing
-from experiments.scene.stage import TOUCH_S, TRAIL, TRAIL_S, LinkTracker, Moment, SceneModel, drawn_errors
+from experiments.scene.stage import TOUCH_S, TRAIL, TRAIL_S, LinkTracker, Moment, SceneModel, with_bare_links
 from experiments.view.live import FRAME_S, IDLE_S, TABLE_S, Page
 from experiments.view.panel import HISTORY_S, PLOT_S, History, robot_rows
 from twins.arrays import Array, Index
@@ -112,7 +113,9 @@ class Film:
         grid = np.arange(self.begin, self.end, PLOT_S)
         error = np.zeros((len(grid), len(stage.links)))
         if stage.plan is not None and len(stage.links):
-            error = np.nan_to_num(drawn_errors(stage.plan, grid, self.positions(grid)), posinf=np.inf)
+            place = self.positions(grid)
+            error = errors_over_time(stage.plan.law, stage.plan.formation, grid, place)
+            error = np.nan_to_num(with_bare_links(stage.plan, grid, place, error), posinf=np.inf)
         sent = [np.searchsorted(each, grid) - np.searchsorted(each, grid - 1.0) for each in self._sent]
         history.time = grid.tolist()
         history.error = [self.links.of_robots(each) for each in error]
