@@ -308,21 +308,24 @@ class Detector:
         found = 0
         if motion_check.unresponsive or ascent.stalled:
             found |= 1 << Cause.UNRESPONSIVE
-        if motion_check.uncommanded or ascent.carried:
+        if self.flies and now.t >= self.direction.due:
+            self.follow_direction(now, status)
+        if motion_check.uncommanded or ascent.carried or self.direction.against:
             found |= 1 << Cause.STRAYING
-        return found | self.of_outside(now, status) if self.outside else found
+        if self.outside:  # positions that mislead the controller on board
+            found |= (1 << Cause.TURNED if self.direction.turned else 0) | (1 << Cause.STUCK if ascent.stuck else 0)
+        return found
 
-    def of_outside(self, now: Situation, status: RobotStatus) -> int:
-        """Positions from outside that mislead a controller on board."""
-        direction, goal = self.direction, status.setpoint
-        if status.climbing:
-            goal = (self.ascent.begin[0], self.ascent.begin[1], 0.0, 0.0)
-        if not (now.state.flying and isfinite(goal[0]) and isfinite(goal[1]) and (status.climbing or status.cruising)):
+    def follow_direction(self, now: Situation, status: RobotStatus) -> None:
+        """Compare commanded and measured accelerations of a drone."""
+        direction, setpoint = self.direction, status.setpoint
+        if status.climbing and self.outside:
+            setpoint = (self.ascent.begin[0], self.ascent.begin[1], 0.0, 0.0)
+        follows = now.state.flying and (status.cruising or (status.climbing and self.outside))
+        if not (follows and isfinite(setpoint[0]) and isfinite(setpoint[1])):
             direction.forget()
-        elif not now.invalid:
-            direction.update(now.t, goal[0], goal[1], now.position, now.velocity)
-        found = 1 << Cause.TURNED if direction.turned else 0
-        return found | 1 << Cause.STUCK if self.ascent.stuck else found
+        elif not now.invalid and isfinite(now.velocity[0]) and isfinite(now.velocity[1]):
+            direction.update(now.t, setpoint[0], setpoint[1], now.position, now.velocity)
 
     def leans(self, state: BodyState) -> bool:
         """Whether it leans, by a first sample or a newer one: the first one alone, repeated, proves nothing."""
@@ -404,7 +407,11 @@ class Detector:
                 "it does not rise" if ascent.stalled else f"{motion_check.commanded:.2f} m commanded in vain"
             ),
             Cause.STRAYING: lambda: (
-                f"{ascent.aside:.2f} m aside while it climbs" if ascent.carried else motion_check.words()
+                f"{ascent.aside:.2f} m aside while it climbs"
+                if ascent.carried
+                else "it flies against its commands; are its axes swapped or mirrored?"
+                if self.direction.against
+                else motion_check.words()
             ),
             Cause.UNREACHABLE: lambda: f"for {t - state.received:.1f} s",
             Cause.HOVERING: lambda: f"at {now.position[2]:.2f} m",

@@ -1,9 +1,11 @@
 """Check of the direction of flight: a drone must accelerate where it is commanded to.
 
 A drone that takes the yaw of its positions for its own, although the frame of its object is turned against its nose,
-accelerates beside each command by that angle. From 60° on it circles wider and wider. The check compares the
-acceleration that follows from position errors and velocities with the measured one. Their correlation tells the angle
-as soon as the drone wobbles by some centimetres. A push, noise or a lag of another size turns nothing.
+accelerates beside each command by that angle. From 60° on it circles wider and wider. One with swapped or mirrored
+axes flies away, faster and faster: it accelerates against its commands. The check compares the acceleration that
+follows from commanded and measured velocities with the measured one. Their correlation tells the angle as soon as the
+drone wobbles by some centimetres. A push, noise or a lag of another size turns nothing. A wind does for a moment, and
+so do circles by late positions, but not by as much as swapped axes.
 
 Quiet: all of it.
 """
@@ -24,6 +26,8 @@ ALIKE: Final = 0.6  # least correlation of commanded and measured accelerations
 ASIDE: Final = (
     0.65  # [rad] largest angle between the two: right ones show up to 0.53, a frame turned by 60° at least 0.72
 )
+AGAINST: Final = 2.0  # [rad] smallest angle of swapped or mirrored axes; late ones on circles show up to 1.1
+AGAINST_S: Final = 0.3  # time for which that counts: a gust is shorter
 ROUNDING_S: Final = 1e-6
 
 
@@ -31,12 +35,13 @@ class DirectionCheck:
     """Commanded and measured accelerations of one drone, seen from above."""
 
     __slots__ = (
-        "angle", "asks", "cross", "due", "gain", "inline", "lag", "last", "moves", "response", "speed", "turned",
-        "velocity", "x", "y",
+        "against", "angle", "asks", "by_position", "cross", "due", "gain", "inline", "lag", "last", "moves",
+        "opposed_s", "response", "speed", "turned", "velocity", "x", "y",
     )  # fmt: skip
 
     def __init__(self, kind: Kind) -> None:
         self.response, self.speed = kind.response, kind.speed
+        self.by_position = kind.takes == "position"
         self.lag = 0.5 * max(kind.lag, SAMPLE_S)  # lag of the tilt; the velocity loop has the other half [s]
         self.gain = 1.0 / self.lag  # gain of that loop [1/s]
         self.forget()
@@ -44,6 +49,7 @@ class DirectionCheck:
     def forget(self) -> None:
         """Restart."""
         self.turned = False  # the drone accelerates beside its commands
+        self.against, self.opposed_s = False, 0.0  # it accelerates against them; duration so far [s]
         self.angle = 0.0  # angle by this comparison [rad]
         self.last = self.due = -inf  # times of the last comparison and of the next [s]
         self.velocity = ZERO  # velocity at the last comparison [m/s]
@@ -51,13 +57,15 @@ class DirectionCheck:
         # sums over comparisons: products along and across, squares of commanded and of measured ones [m²/s³]
         self.inline = self.cross = self.asks = self.moves = 0.0
 
-    def update(self, t: float, goal_x: float, goal_y: float, position: Vector, velocity: Vector) -> None:
-        """Compare at `t` [s], on the way to a goal [m]; `position` [m] and `velocity` [m/s] are measured."""
-        if t < self.due:
-            return
+    def update(self, t: float, x: float, y: float, position: Vector, velocity: Vector) -> None:
+        """Compare at `t` [s], when it is `due`: x, y is the setpoint, a place [m] or a velocity [m/s].
+
+        `position` [m] and `velocity` [m/s] are measured.
+        """
         since, self.last = t - self.last, t
         self.due = t + SAMPLE_S - ROUNDING_S
-        x, y = self.response * (goal_x - position[0]), self.response * (goal_y - position[1])
+        if self.by_position:
+            x, y = self.response * (x - position[0]), self.response * (y - position[1])
         share = min(self.speed / max(sqrt(x * x + y * y), self.speed), 1.0)
         x, y = self.gain * (share * x - velocity[0]), self.gain * (share * y - velocity[1])
         before, self.velocity = self.velocity, velocity
@@ -76,4 +84,7 @@ class DirectionCheck:
         self.moves = keep * self.moves + since * (x * x + y * y)
         self.angle = atan2(self.cross, self.inline)
         alike = self.inline * self.inline + self.cross * self.cross > ALIKE * ALIKE * self.asks * self.moves
-        self.turned = alike and abs(self.angle) > ASIDE and self.asks > LEAST * LEAST * FORGET_S
+        moving = alike and self.asks > LEAST * LEAST * FORGET_S
+        self.turned = moving and abs(self.angle) > ASIDE
+        self.opposed_s = self.opposed_s + since if moving and abs(self.angle) > AGAINST else 0.0
+        self.against = self.opposed_s > AGAINST_S

@@ -8,7 +8,8 @@ measured positions nor their resolution matters.
 A turn of the wrong sign, or swapped wheels, need not lead far away. They show in the correlation of commanded and
 measured motion, however slow. Commands that take effect late let a right body move against those of the moment, if they
 alternate: only a body that moves against those of the piece before as well is wrong. A wind carries drones against
-slow commands, so that their way is judged by its length alone.
+slow commands, so that their way is judged by its length alone. (`direction_check` finds mirrored ones.) Commands
+against a steady wind do not count: a drone without an integral part leans against it, by an error of its place.
 
 Quiet: all but `words`.
 """
@@ -32,6 +33,7 @@ LEAST_WITHOUT_S: Final = 2.0  # shortest time without motion that counts
 FORGET_S: Final = 5.0  # time after which uncommanded motion is forgotten
 KEPT: Final = 1.0 - PIECE_S / FORGET_S  # share of earlier uncommanded motion that a piece keeps
 RUSH_S: Final = 0.5  # tolerated uncommanded travel, in seconds at top speed, besides the size of the robot
+RESTS_S, MOVES_S = 1.0, 8.0  # time to learn a steady wind, of a drone that rests, and of one that moves
 ROUNDING_S: Final = 1e-6
 OUTSIDE_M: Final = 0.4  # [m] the same of robots that fly on board by positions from outside, which may ring
 TURN: Final = 1.5  # tolerated uncommanded rotation of a wheeled robot [rad]
@@ -50,11 +52,11 @@ class MotionCheck:
     __slots__ = (
         "anchor", "anchor_yaw", "before_turn", "before_x", "before_y", "begin", "begin_yaw", "by_position", "by_twist",
         "commanded", "commanded_s", "commanded_turn", "drift", "drifted", "due", "expected_turn", "expected_x",
-        "expected_y", "flies", "follows", "free", "last", "late_turn", "late_x", "late_y", "response", "rim", "samples",
-        "slow", "speed", "turn", "turn_before", "turned", "turned_asked", "turned_asked_before", "turned_both",
-        "turned_both_before", "turns_against", "unanswered", "unanswered_turn", "uncommanded", "uncommanded_turn",
-        "unresponsive", "way", "way_against", "way_asked", "way_asked_before", "way_before", "way_both",
-        "way_both_before", "way_moved", "without", "x", "y", "z",
+        "expected_y", "flies", "follows", "free", "last", "late_turn", "late_x", "late_y", "push_x", "push_y",
+        "response", "rim", "samples", "slow", "speed", "turn", "turn_before", "turned", "turned_asked",
+        "turned_asked_before", "turned_both", "turned_both_before", "turns_against", "unanswered", "unanswered_turn",
+        "uncommanded", "uncommanded_turn", "unresponsive", "way", "way_against", "way_asked", "way_asked_before",
+        "way_before", "way_both", "way_both_before", "way_moved", "without", "x", "y", "z",
     )  # fmt: skip
 
     def __init__(self, kind: Kind, *, outside: bool = False) -> None:
@@ -81,6 +83,7 @@ class MotionCheck:
         self.way = self.way_before = ZERO
         self.turn = self.turn_before = 0.0
         self.drift, self.drifted = ZERO, 0.0  # recent uncommanded travel [m], and its length [m]
+        self.push_x = self.push_y = 0.0  # what a piece commands in vain, against a steady wind [m]
         self.uncommanded_turn = 0.0  # recent uncommanded rotation [rad]
         # commanded motion with the lag of the body, of the last sample and of the piece [m], [rad]
         self.late_x = self.late_y = self.late_turn = 0.0
@@ -207,6 +210,7 @@ class MotionCheck:
         """Add the motion beyond, against or aside of the commanded travel, in the piece that ends."""
         moved = difference(position, self.begin)
         x, y, z = self.way[0] + self.way_before[0], self.way[1] + self.way_before[1], self.way[2] + self.way_before[2]
+        x, y = x - 2.0 * self.push_x, y - 2.0 * self.push_y
         length = sqrt(x * x + y * y + z * z)
         least = max(length, 1e-9)
         toward = x / least, y / least, z / least
@@ -224,6 +228,8 @@ class MotionCheck:
                 KEPT * drift[1] + moved[1] - obeyed * toward[1],
                 KEPT * drift[2] + moved[2] - obeyed * toward[2],
             )
+            if self.flies:
+                self.feel_wind(moved[0], moved[1])
             if self.by_twist:
                 commanded = self.turn + self.turn_before
                 stray = turned - clamp(turned, min(commanded, 0.0), max(commanded, 0.0))
@@ -239,6 +245,19 @@ class MotionCheck:
         self.way_before, self.turn_before = self.way, self.turn
         self.way, self.turn = ZERO, 0.0
         self.begin, self.begin_yaw = position, yaw
+
+    def feel_wind(self, x: float, y: float) -> None:
+        """Learn what a piece with a motion of x, y [m] commanded in vain; no more than a slow command."""
+        way_x, way_y = 0.5 * (self.way[0] + self.way_before[0]), 0.5 * (self.way[1] + self.way_before[1])
+        vain_x, vain_y = way_x - x, way_y - y
+        if vain_x * way_x + vain_y * way_y > 0.0:  # else it drifts
+            rests = x * x + y * y < MOVES * MOVES * (way_x * way_x + way_y * way_y)
+            share = PIECE_S / (RESTS_S if rests else MOVES_S)
+            push_x, push_y = self.push_x, self.push_y
+            push_x, push_y = push_x + share * (vain_x - push_x), push_y + share * (vain_y - push_y)
+            most = self.slow * PIECE_S
+            less = most / max(sqrt(push_x * push_x + push_y * push_y), most)
+            self.push_x, self.push_y = less * push_x, less * push_y
 
     def correlate(self, x: float, y: float, turned: float) -> None:
         """Correlate the measured motion of a piece, x, y [m] and `turned` [rad], with the commanded one."""

@@ -25,6 +25,7 @@ CAUSES = "agents/safety/test_detection.py::test_causes_of_one_tick"
 CAPTURED = "agents/body/test_measured_positions.py::test_"
 LOCKS = "agents/body/test_device_locks.py::test_"
 MISLED = "agents/safety/test_misleading_positions.py::test_"
+MIRRORED = "experiments/virtual_time/test_mirrored.py::test_"
 MOTION = "agents/safety/test_motion_check.py::test_"
 POSES = "agents/runtime/test_pose_inbox.py::test_"
 READY = "agents/safety/test_detection.py::test_reason_why_a_drone_is_not_ready"
@@ -74,6 +75,8 @@ SAFETY: Final = {
     "(0.75 s on wheels)": f"{MOTION}wheels_that_ignore_or_need_no_commands",
     "commanded over 10 s": f"{MOTION}slow_motion_against_commands_is_found",
     "to and fro in a second and take effect up to 0.6 s late": f"{MOTION}late_motion_is_not_against_commands",
+    "by more than 2 rad, for 0.3 s": f"{MIRRORED}drone_with_wrong_axes_lands_near_its_place",
+    "within 1 s at rest, 8 s in motion": f"{MIRRORED}steady_wind_is_no_fault",
     "rise by 5 cm in 4 s (Tello: 10 s": "agents/safety/test_detection.py::test_climb_without_measured_height",
     "halt after 2 s more": f"{ROW}[stuck_wheels]",
     "counts for about 5 s": f"{MOTION}robot_that_moves_without_being_told",

@@ -1,11 +1,18 @@
-"""Robots with a turn of the wrong sign end a run, with the probable cause; right ones raise no alarm."""
+"""Robots that move against their commands end a run, with the probable cause; right ones raise no alarm."""
 
+import numpy as np
 import pytest
 
-from agents.safety.hazards import Cause, failed
+from agents.body.interface import Disturbance
+from agents.safety.hazards import Cause, Outcome, failed
+from experiments.definition.experiment import LegTable, RobotTable
 from experiments.file import document
 from tests.experiments.virtual_time.evaluators import evaluated
+from tests.small import small
 from twins.models.differential import Differential
+from twins.models.onboard_flight import OnboardFlight
+
+drones = pytest.mark.parametrize("kind", ["crazyflie", "tello"])
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -18,3 +25,44 @@ def test_turn_of_the_wrong_sign_fails_a_run(sign, monkeypatch):
     for each in found.values():
         assert failed(each.text)
         assert each.text.endswith("is the sign of its turn wrong, are its wheels swapped?")
+
+
+def flown(drone, disturbance, **plan):
+    """Log of a drone that begins a plan after a second."""
+    robot = RobotTable(kind=drone, start=[0.0, 0.0], hover=0.8)
+    legs = [LegTable(at_s=1.0, robot="A", plan=plan)]
+    experiment = small({"A": robot}, duration_s=12.0, timeline=legs, disturbance={"all": disturbance})
+    return evaluated(experiment, compiled=False)[0]
+
+
+def command_of(axes, right=OnboardFlight.command):
+    """Commands to a drone with other axes: both rows of the matrix that turns a commanded way."""
+
+    def command(self, setpoint):
+        at = np.zeros(2) if self._by_velocity else np.array(self.held[:2])
+        x, y = at + np.array(axes) @ (np.array(setpoint[:2]) - at)
+        right(self, (x, y, *setpoint[2:]))
+
+    return command
+
+
+@drones
+@pytest.mark.parametrize("axes", [((0, 1), (1, 0)), ((0, -1), (-1, 0)), ((-1, 0), (0, 1)), ((-1, 0), (0, -1))])
+def test_drone_with_wrong_axes_lands_near_its_place(axes, kind, monkeypatch):
+    """A drone that took north for east flew 1.2 m before it landed."""
+    monkeypatch.setattr(OnboardFlight, "command", command_of(axes))
+    log = flown(kind, Disturbance(position_sigma=0.0005), kind="line", move_by=[0.6, -0.8], speed=0.3)
+    ((_, found),) = [each for each in log.incidents if each[1].outcome >= Outcome.LAND]
+    assert found.cause == Cause.STRAYING
+    assert found.text.endswith("are its axes swapped or mirrored?")
+    off = np.hypot(*(log.true_position - log.goal)[log.time < found.time, 0, :2].T)
+    assert np.nanmax(off) < 0.6
+
+
+@drones
+@pytest.mark.parametrize(("radius", "period_s"), [(0.3, 4.0), (0.3, 6.0), (0.5, 12.0)])
+def test_steady_wind_is_no_fault(radius, period_s, kind):
+    """A drone on a circle, with an error of its place by which it holds the wind, was landed."""
+    wind = [0.65, -0.75] if kind == "crazyflie" else [0.4, -0.5]
+    log = flown(kind, Disturbance(position_sigma=0.0005, wind=wind), kind="circle", radius=radius, period_s=period_s)
+    assert not log.incidents
