@@ -41,6 +41,7 @@ class PositionSource:
     # stamp of the last position less the time of its arrival [s]: the clock of the source is ahead by at least this
     # value, or, if it is negative, behind or late; NaN before the first
     ahead: float = nan
+    refused_at: float = -inf  # arrival of the last position that cannot be true [s]
     used_at: float = -inf  # arrival of the last position that was new and not late [s]
     last: tuple[Vector, float | None] | None = None  # position [m] and yaw [rad]
     new_at: float = -inf  # arrival of the last pose that was new [s],
@@ -122,6 +123,7 @@ class MeasuredPositions:
                     validation.check_position(measured, now=utc + now, valid_box=self._valid_box)
                 except messages.Malformed as error:
                     source.inbox.refuse(str(error))
+                    source.refused_at = now
                     continue
                 new = source.measures(session, (measured.position, measured.yaw), now)
                 if new and source.ahead < -source.late_s:
@@ -149,6 +151,8 @@ class MeasuredPositions:
             yield SECOND
         if source.ahead < -source.late_s and unused_s > REPEATED_S:
             yield LATE.format(-source.ahead, source.late_s)
+        elif unused_s > REPEATED_S and now - source.refused_at <= SECOND_S:
+            yield UNUSED.format(source.key, source.inbox.trouble)
         elif unused_s == inf and now - self._begun > NOTHING_S and not source.repeats:
             refused = source.inbox.malformed > 0
             yield UNUSED.format(source.key, source.inbox.trouble) if refused else NOTHING.format(source.key)

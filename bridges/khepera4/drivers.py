@@ -20,6 +20,7 @@ NEVER: Final = math.inf
 REPORTED_S: Final = (0.004, 0.045)  # a report of way that covers less or more is not used to complete another
 GAP_S: Final = 0.3  # [s] commands further apart were parted by a gap of the link
 FIRST_ANSWER_S: Final = 3.0  # [s] patience for the first answer: a late one spends the only client of a server of 2023
+GLUED_S: Final = 0.15  # [s] time without an answer to `p` after which it is sent again
 ASK_AGAIN_S: Final = 1.4  # [s] pause before another `p`: a server does not see the one that is glued to a stop
 MAX_INPUT_BYTES: Final = 1 << 16  # [bytes] longest input: no robot sends as much
 PLACED_S: Final = 1.0  # [s] pause between two positions that are given to a server which does not tell its own
@@ -129,8 +130,7 @@ class RoboticParkServer(Driver):
     def move(self, odometer: Odometer) -> None:
         self._add(self._reports(self._wire.pending()), odometer)  # late answers, after a gap
         before, asked = self._sent, self._asked
-        self._asked = self._send(b"p")
-        answer = self._receive("p")
+        answer = self._ask()
         reports = self._reports(answer)
         if not reports:
             raise UnknownAnswer(f"answers p with {_shown(answer)}, not with {self._count} numbers as before")
@@ -160,9 +160,18 @@ class RoboticParkServer(Driver):
         self._sent = self._sent[1], now
         return now
 
-    def _receive(self, asked: str) -> bytes:
+    def _ask(self) -> bytes:
+        """The answer to `p`, which is asked twice: the network may glue the first to the command before it."""
+        deadline = uptime() + self.patience_s
+        self._asked = self._send(b"p")
+        with contextlib.suppress(TimeoutError):
+            return self._wire.receive(min(deadline, uptime() + GLUED_S))
+        self._asked = self._send(b"p")
+        return self._receive("p", deadline)
+
+    def _receive(self, asked: str, deadline: float = NEVER) -> bytes:
         try:
-            return self._wire.receive(uptime() + self.patience_s)
+            return self._wire.receive(min(deadline, uptime() + self.patience_s))
         except TimeoutError as error:
             raise TimeoutError(f"no answer to {asked}") from error
 

@@ -93,7 +93,7 @@ class PoseFilter:
         self._pose: list[MeasuredPose | None] = [None] * count  # last pose of each robot,
         self._new_at = [-math.inf] * count  # time since which it is the same [s]
         self._reported: list[str | None] = [None] * count
-        self._refusal = ""  # reason why the axes cannot be used
+        self._refusal, self._axis = "", ""  # reason why the axes cannot be used; first axis that pointed up
         self._invalid = 0
 
     @property
@@ -110,7 +110,8 @@ class PoseFilter:
             arrived: Time of arrival on any steady clock [s]; the times of measurement are on the same clock.
             waited: Time since the measurement beside the latency that the frame says [s].
         """
-        measured = arrived - (0.0 if math.isnan(frame.latency_s) else frame.latency_s) - waited
+        latency = frame.latency_s if frame.latency_s > 0.0 else 0.0  # also of NaN: nothing is measured in the future
+        measured = arrived - latency - waited
         up = frame.up or self._coordinates.up or self._up
         self._check_axes(up)
         poses = []
@@ -133,8 +134,11 @@ class PoseFilter:
         """Say so, once, where the upward axis of the system cannot be used or is another than the file says."""
         asked = self._coordinates.up
         refusal = "" if up in ("y", "z") else NOT_UPRIGHT
+        self._axis = self._axis or ("" if refusal else up)
         if not refusal and asked and asked != up:
             refusal = f"no positions: the system says that its {up} axis points up, not {asked} as `up` says"
+        elif not refusal and up != self._axis:
+            refusal = f"no positions: the {up} axis points up now, not {self._axis}: start this bridge again"
         if refusal != self._refusal:
             self._refusal = refusal
             self._print_line(refusal or f"the {up} axis points up")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator
 from math import degrees
 from typing import Final
@@ -100,16 +101,17 @@ def libraries(analysis: Analysis) -> Iterator[Finding]:
     """Report bodies of robots of this machine with a missing library."""
     experiment = analysis.plan.experiment
     elsewhere = {name for host in experiment.hosts.values() for name in host.robots}
+    robots = defaultdict(list)
     for name, robot in experiment.robots.items():
-        body, remedy = registry.body_name(robot.body), "`./zenpark hardware` adds it"
-        if name in elsewhere:
-            continue
+        if name not in elsewhere:
+            robots[registry.body_name(robot.body)].append(name)
+    for body, names in robots.items():
+        of_robots, path = f"the body '{body}' of {join_names(names)}", ("robots", names[0], "body")
         if library := bodies.missing_library(body):
-            message = f"the body of {name} needs {library}, which is not installed here"
-            yield Finding("warning", "library", message, remedy, ("robots", name, "body"))
+            message = f"{of_robots} needs {library}, which is not installed here"
+            yield Finding("warning", "library", message, "`./zenpark hardware` adds it", path)
         elif body in registry.names(registry.BODIES) and bodies.body_class(body) is None:
-            message = f"the body '{body}' of {name} cannot be loaded here"
-            yield Finding("warning", "library", message, "install what it imports", ("robots", name, "body"))
+            yield Finding("warning", "library", f"{of_robots} cannot be loaded here", "install what it imports", path)
 
 
 def devices(analysis: Analysis) -> Iterator[Finding]:

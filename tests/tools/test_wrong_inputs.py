@@ -138,7 +138,7 @@ def test_a_missing_library_is_a_finding(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
     experiment = loads(TRIANGLE.replace("hover = 0.6", "hover = 0.6\n" + RADIO)).experiment
     (claim,) = libraries(SimpleNamespace(plan=Plan(experiment)))
-    assert claim.message == "the body of CF01 needs cflib, which is not installed here"
+    assert claim.message == "the body 'radio' of CF01 needs cflib, which is not installed here"
     assert claim.remedy == "`./zenpark hardware` adds it"
 
 

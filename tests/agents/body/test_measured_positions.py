@@ -124,6 +124,19 @@ def test_late_positions_are_refused_and_named(delay_s, taken, note):
     assert (used, heard.malformed, state.note) == (taken, 49 - taken, note)
 
 
+def test_places_beyond_any_room_are_named_in_flight():
+    """A unit that changes: metres, then millimetres."""
+    net, state = Net(), BodyState()
+    with net.worn():
+        heard = listening(net)
+        for tick in range(80):
+            t, scale = 8.0 + DT * tick, 1.0 if tick < 40 else 1000.0
+            net.deliver(position(UTC + t, (scale * (0.1 + 0.001 * tick), 0.2, 0.0)))
+            list(heard.receive(UTC, t))
+        heard.annotate([BodyState(), state], t)
+    assert state.note.startswith("what comes on park/T/position is refused: ")
+
+
 def test_single_late_position_is_no_fault():
     net, state = Net(), BodyState()
     with net.worn():

@@ -181,6 +181,46 @@ def test_overtaking_frames_and_false_axes_are_left_out(printed):
     ]
 
 
+def test_an_axis_that_changes_ends_the_positions(printed):
+    pose_filter = PoseFilter({"CF01": "CF01"}, printed.append)
+    ups = "zzyyz"
+    heard = [pose_filter.filter_poses(frame(CF01=(0.01 * k, 0.0, 1.0), up=up), 0.1 * k) for k, up in enumerate(ups)]
+    assert [len(poses) for poses in heard] == [1, 1, 0, 0, 1]
+    assert printed[1:] == [
+        "no positions: the y axis points up now, not z: start this bridge again", "the z axis points up"
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("wrong", [-10.0, 1e9, math.inf, -math.inf, math.nan])
+def test_false_latencies_hide_no_other_pose(wrong):
+    pose_filter, left_out = PoseFilter({"CF01": "CF01"}, lambda _: None), []
+    for k in range(50):
+        latency = wrong if k in {0, 20} else 0.004
+        poses = pose_filter.filter_poses(frame(CF01=(0.001 * k, 0.0, 1.0), latency=latency), 0.01 * k)
+        assert all(measured <= 0.01 * k for _, measured, *_ in poses)
+        left_out += [] if poses else [k]
+    assert set(left_out) <= {0, 20}
+
+
+@pytest.mark.parametrize(("begin", "rate_hz"), [(2**32 - 20, 100.0), (7, 240.0), (7, 30.0)])
+def test_numbers_that_wrap_and_another_rate_go_on(monkeypatch, printed, begin, rate_hz):
+    """Frames of 100 Hz, from half a second on at another rate, by a clock that counts the frames as Vicon's does."""
+    stream = Stream(monkeypatch, printed)
+    numbers = iter(range(begin, begin + 1000))
+
+    def newest(_timeout):
+        period = 1.0 / (100.0 if stream.now < 5.5 else rate_hz)
+        stream.now += period
+        number = next(numbers) % 2**32
+        return frame(number, CF01=(0.01 * stream.now, 0.0, 0.5), clock=number * period)
+
+    stream.newest = newest
+    assert stream.bridge.run(lambda: stream.now > 7.0)
+    stamps = np.array([stamp for stamp, _ in stream.published])
+    assert np.diff(stamps).max() < 0.13
+    assert stamps[-1] == pytest.approx(1.8e9 + stream.now, abs=0.01)
+
+
 def test_the_command_line_is_understood_or_refused():
     assert parse_server("vicon", 801) == ("vicon", 801)
     assert parse_server("10.0.0.7:8801", 801) == ("10.0.0.7", 8801)
