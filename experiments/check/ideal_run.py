@@ -57,7 +57,7 @@ def has_noise(plan: Plan) -> bool:
 
 
 def isolated(plan: Plan) -> Plan:
-    """The same without scatter, walls, obstacles, avoidance and shadows, as far as it is flown for `check`."""
+    """The same without walls, obstacles, avoidance and shadows, as far as it is flown for `check`."""
     experiment = plan.experiment
     robots = {
         name: msgspec.structs.replace(robot, shadow=None, sensors=None, lands_at_s=None)
@@ -73,7 +73,6 @@ def isolated(plan: Plan) -> Plan:
         ),
         world=WorldTable(),
         avoidance=None,
-        start=msgspec.structs.replace(experiment.start, scatter=0.0, scatter_yaw=0.0),
         safety=msgspec.structs.replace(experiment.safety, separation=None),
         rates=msgspec.structs.replace(experiment.rates, state_hz=experiment.rates.coordination_hz),
     )

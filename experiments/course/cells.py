@@ -53,18 +53,32 @@ def main() -> NoReturn:
         with suppress(Exception):  # an import in the law itself says why
             if _is_installed(name):
                 import_module(name)
+    codes: dict[int, int] = {}  # exit codes of cells by their numbers
     while True:
         asked, descriptors, _, _ = socket.recv_fds(control, 64, 1)
         if not asked:
             os._exit(0)
         if descriptors:
-            number = os.fork()
-            if number == 0:
+            answer = os.fork()
+            if answer == 0:
                 _live(descriptors[0])
             os.close(descriptors[0])
-            control.send(b"%d" % number)
+            codes.pop(answer, None)
         else:
-            control.send(b"%d" % os.waitstatus_to_exitcode(os.waitpid(int(asked), 0)[1]))
+            _reap(codes, int(asked))
+            answer = codes[int(asked)]
+        control.send(b"%d" % answer)
+        _reap(codes)
+
+
+def _reap(codes: dict[int, int], number: int = -1) -> None:
+    """Wait for the end of a cell; without a number, note those that have ended."""
+    with suppress(ChildProcessError):
+        while number not in codes:
+            ended, status = os.waitpid(number, os.WNOHANG if number < 0 else 0)
+            if ended == 0:
+                break
+            codes[ended] = os.waitstatus_to_exitcode(status)
 
 
 def _is_installed(name: str) -> bool:

@@ -10,7 +10,7 @@ from experiments.check.check import figures
 from experiments.check.ideal_run import Prediction, isolated, predict, repetitions
 from experiments.check.motion import flight
 from experiments.check.theory import unknown_robots, unused_gains
-from experiments.definition.experiment import Arena, Experiment, Formation, LegTable, LinkTable, RobotTable
+from experiments.definition.experiment import Arena, Experiment, Formation, LegTable, LinkTable, RobotTable, Start
 from experiments.definition.formation import linear_step
 from experiments.definition.plan import Plan
 from experiments.file import document
@@ -155,6 +155,12 @@ FAST = Formation(
 )
 
 
+def met(scatter: float = 0.0) -> Experiment:
+    """Robots that begin in their formation, up to a scatter of the starts, with a law that is too fast."""
+    robots = {name: robot(x, y, 0.8) for name, (x, y) in PLACES.items()}
+    return small(robots, formation=FAST, duration_s=20.0, start=Start(scatter=scatter))
+
+
 def low(hover: float, top: float) -> Experiment:
     """A Crazyflie overshoots its take-off by up to 11 %."""
     return small({"F": robot(0.0, 0.0, hover)}, arena=Arena(size=(4.0, 4.0, top)), duration_s=5.0)
@@ -188,6 +194,8 @@ BESIDE = small({"G": robot(0.0, 0.0), "F": robot(0.5, 0.0, 0.8)}, {"G > F": 0.80
          "the robots balance in another shape", "off the line"),
         (small(RING, formation=FAST, duration_s=20.0), "warning", "keeps-oscillating",
          "the robots oscillate to the end: from 15 to 20 s", "the law 'consensus'"),
+        (met(), None, "keeps-oscillating", "", ""),
+        (met(scatter=0.1), "warning", "keeps-oscillating", "the robots oscillate to the end: from 15 to 20 s", ""),
         (low(1.0, 1.05), "warning", "overshoots-arena", "to 1.11 m", "hover at 0.94 m at most"),
         (low(0.94, 1.05), None, "overshoots-arena", "", ""),
     ],
