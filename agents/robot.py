@@ -279,7 +279,15 @@ class Robot:
         life, now = self.lifecycle, self.now
         if t < life.settled_until:
             return True
+        if life.phase == READY and not life.climbing:
+            return self._stays_ready()
         return not self.landing.aside and life.stays(t, now.position, now.velocity, now.state.flying)
+
+    def _stays_ready(self) -> bool:
+        """Whether a ready robot stays ready, as nothing fails, and nothing did; quiet."""
+        if self._ordered or self.landing.aside or self.guidance is not None or self.neighbours.unreceived():
+            return False
+        return self._preflight.passes(self.now, self.neighbours, self.health)
 
     def live(self, t: float) -> None:
         """Advance the phase of a robot that is not steady, with what follows."""

@@ -131,6 +131,7 @@ class RangeScan(msgspec.Struct, frozen=True):
 class BodyState:
     """State of the body of one robot; unknown numbers are NaN."""
 
+    FIXED: ClassVar = ("refusal",)
     RARE: ClassVar = ("scan",)
 
     time: float = nan  # time at which the pose was measured, on the clock of `Body.read` [s]

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from functools import lru_cache
 from math import inf
 from typing import Final, NamedTuple
 
@@ -119,6 +120,7 @@ _LOST: Final[Mapping[str, Outcome]] = {
 }
 
 
+@lru_cache(16)
 def rules(limits: Limits) -> list[Rule]:
     """Rules of all causes, with the numbers and the choices of an experiment."""
     chosen = {

@@ -1,4 +1,4 @@
-"""Preflight checks: conditions for take-off, with the reason where one fails. None of it runs on quiet ticks.
+"""Preflight checks: conditions for take-off, with the reason where one fails. `Preflight.passes` alone is quiet.
 
 The plug-ins of a robot are rehearsed: called before take-off, and their results are checked.
 """
@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 from math import degrees, hypot, inf, isnan, radians, remainder, tau
 from numbers import Real
-from typing import Final
+from typing import ClassVar, Final
 
 from agents.body.interface import BodyState
 from agents.decision.assignment import Assignment
@@ -29,6 +29,7 @@ REST_M_S: Final = 0.3  # largest speed at rest
 LEVEL: Final = 0.35  # [rad] largest tilt at rest
 WALL_M: Final = 0.05  # a place measured this far outside the arena may be inside
 TURNED: Final = radians(20.0)  # largest difference of a yaw from that of its start
+SURE: Final = 0.99  # share of a limit below which rounding decides nothing
 ABOVE_M: Final = 0.1  # [m] a robot higher than this is above one that stands,
 BESIDE_M: Final = 0.1  # [m] enough distance of the two, seen from above
 # remedy for a measured yaw that is not that of the robot
@@ -39,6 +40,8 @@ NUMBERS: Final = {1: "a number", 3: "three numbers", 4: "four numbers"}  # kinds
 class Preflight:
     """Checks of a robot, and the duration of their failure."""
 
+    RARE: ClassVar = ("_other_starts",)
+
     def __init__(self, assignment: Assignment) -> None:
         self._assignment, self._limits = assignment, assignment.limits
         self._since, self._covered = inf, False  # covered: a drone with a robot above it
@@ -47,6 +50,9 @@ class Preflight:
             each for each in assignment.starts if hypot(each[1] - x, each[2] - y) > assignment.kind.radius + each[3]
         ]
         self._nearest_start = min((hypot(each[1] - x, each[2] - y) for each in self._other_starts), default=inf)
+        self._flies, self._placed = assignment.kind.flies, assignment.start is not None
+        self._start, self._yaw = (x, y), assignment.start_yaw
+        self._near = SURE * min(assignment.start_within, 0.5 * self._nearest_start)
 
     def check(self, now: Situation, missing: Sequence[str], neighbours: Neighbours, health: ProcessHealth) -> str:
         """First reason why the robot must not take off, empty if there is none.
@@ -60,6 +66,25 @@ class Preflight:
             self._surroundings(now, neighbours, above),
         )  # fmt: skip
         return next(reasons, "")
+
+    def passes(self, now: Situation, neighbours: Neighbours, health: ProcessHealth) -> bool:
+        """Whether `check` surely finds nothing, as it did before; where that is not sure, False. Quiet."""
+        state, limits = now.state, self._limits
+        if self._since < inf or state.refusal or limits.separation is not None or health.offline_since < inf:
+            return False
+        if now.invalid or now.excess > WALL_M or state.battery < limits.battery_min:
+            return False
+        if self._placed:
+            x, y = now.position[0] - self._start[0], now.position[1] - self._start[1]
+            if x * x + y * y > self._near * self._near or abs(now.yaw - self._yaw) > SURE * TURNED:
+                return False
+        if self._flies:
+            if now.position[2] > FLOOR_M or norm(now.velocity) > REST_M_S or tilted(state.attitude, LEVEL):
+                return False
+            for sender in neighbours.all:
+                if sender.position[2] - now.position[2] > ABOVE_M:
+                    return False
+        return True
 
     def lost(self, t: float, failing: str) -> bool:
         """Whether a check with the reason `failing` has failed for too long for the robot to stay ready."""

@@ -26,7 +26,7 @@ FLOAT, INT, BOOL, UNSIGNED = "float", "int", "bool", "unsigned"
 NUMBERS: Final[dict[type, str]] = {float: FLOAT, int: INT, bool: BOOL}
 LONG: Final = 1000  # length from which a text or a table of a law is none that its step reads
 MEASURES: Final = 12  # most measures of the laws of a run
-LEFT_OUT: Final = {"assignment", "_assignment", "_generator", "_preflight"}  # names of no use to a quiet function
+LEFT_OUT: Final = {"assignment", "_assignment", "_generator"}  # names of no use to a quiet function
 
 
 class Floats(NamedTuple):

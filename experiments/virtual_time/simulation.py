@@ -212,23 +212,30 @@ class VirtualRun:
                 self._sample(t)
             if not landing and t - conductor.start_at >= self.plan.experiment.duration_s - 0.5 * dt:
                 return
-            self._end_tick(t)
+            self._end_tick()
 
     def _fly_stretch(self, end: int = sys.maxsize) -> bool:
         """Fly a compiled stretch, where one pays now, from between the halves of this tick to those of another.
 
         It stays open where it leads beyond tick `end`. Returns whether there was one.
         """
-        stretches = self.stretches
-        if stretches is None or self.network.retired:
+        stretches, first = self.stretches, self._tick
+        if stretches is None or self.network.retired or not (stretches.open or stretches.begin(first)):
             return False
-        if not (stretches.open or stretches.begin(self._tick, self._conductor.next_order(self._tick, self.dt))):
-            return False
-        goes_on = stretches.go(min(end, stretches.end))
-        self._tick = stretches.tick
+        last, goes_on = min(end, stretches.end), True
+        while goes_on and (self._tick < last or stretches.moved):
+            goes_on = stretches.go(min(last, self._conductor.next_order(first, self.dt)))
+            self._tick = first = stretches.tick
+            if goes_on and first < last and not stretches.moved:
+                stretches.order(self._give_orders)
+                first += 1
         if not (goes_on and end < stretches.end) and stretches.leave():
             self._detect(self.time)
         return True
+
+    def _give_orders(self) -> None:
+        self._conductor.give_orders(self.time, self.dt)
+        self.twin.begun_at = self._conductor.start_at
 
     @property
     def time(self) -> float:
@@ -240,7 +247,7 @@ class VirtualRun:
 
         Raises Stuck if robots do not become ready or airborne, or end before.
         """
-        self.stretches = None if self.twin.together else stretches_of(self)
+        self.stretches = None if self.twin.together else stretches_of(self, to_start=True)
         while not self._conductor.over:
             self.observe(self.time)
             self._fly_stretch()
@@ -257,7 +264,7 @@ class VirtualRun:
     def decide(self, t: float) -> None:
         """Second half of the tick at `t` [s]: goals, setpoints and commands, then the orders of the conductor."""
         self._act(t)
-        self._end_tick(t)
+        self._end_tick()
 
     def fly_ticks(self, count: int, *, everything: bool = True) -> None:
         """Fly `count` ticks from between the halves of this one, compiled where that pays.
@@ -300,9 +307,8 @@ class VirtualRun:
         """Common start [s], NaN before it is known."""
         return self._conductor.start_at
 
-    def _end_tick(self, t: float) -> None:
-        self._conductor.give_orders(t, self.dt)
-        self.twin.begun_at = self._conductor.start_at
+    def _end_tick(self) -> None:
+        self._give_orders()
         self._tick += 1
 
     def _receive(self, t: float) -> None:
@@ -384,16 +390,13 @@ class VirtualRun:
             return
         for what, (begin, end) in PLACES.items():
             column = numbers[:, :, begin] if end == begin + 1 else numbers[:, :, begin:end]
-            columns.setdefault(what, []).append(column.copy())
-        alike = {
-            **{what: [getattr(robot.now.state, what) for robot in self.robots] for what in OPTIONAL},
-            "phase": [robot.lifecycle.phase for robot in self.robots],
-        }
+            columns.setdefault(what, []).append(column.astype(np.intp if what == "phase" else float))
         obstacles = [tuple(each) for each in self.twin.engine.obstacles]
         moved = [steps.obstacles.get(t, obstacles) for t in ledger.times[:count]]
         columns.setdefault("obstacles", []).append(np.array(moved).reshape(count, *np.array(obstacles).shape))
-        for what, values in alike.items():
-            columns.setdefault(what, []).append(np.repeat(np.array(values)[None], count, axis=0))
+        for what in OPTIONAL:
+            values = np.array([getattr(robot.now.state, what) for robot in self.robots])
+            columns.setdefault(what, []).append(np.repeat(values[None], count, axis=0))
 
     def _settle(self) -> None:
         """Turn samples into columns."""

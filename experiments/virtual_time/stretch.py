@@ -1,6 +1,7 @@
 """Stretches of a run in which nothing happens to a robot, flown by functions that are compiled where it pays.
 
-A stretch begins and ends between the two halves of a tick. While it lasts, its robots live in records.
+A stretch begins and ends between the two halves of a tick. While it lasts, its robots live in records. Orders of the
+conductor, take-offs and the common start are of a few objects, which are read and written again.
 """
 
 from __future__ import annotations
@@ -8,14 +9,14 @@ from __future__ import annotations
 import ctypes
 import sys
 from array import array
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
 import msgspec
 import numpy as np
 
-from agents.decision.lifecycle import READY
+from agents.decision.lifecycle import AIRBORNE
 from agents.plugins.planners import NO_TARGET, Itinerary
 from agents.robot import Robot
 from experiments.definition.plan import Plan
@@ -37,32 +38,35 @@ ROBOT_TICKS: Final = 1_000_000  # ticks of all its robots: noise is drawn, and r
 LEAST: Final = 20  # ticks below which a stretch is followed by a pause
 PAUSE: Final = 10  # ticks that are flown in plain Python, twice as many after the next short stretch
 LONGEST_PAUSE: Final = 160  # ticks of the longest pause
+AHEAD_S: Final = 5.0  # [s] most that a run takes from its begin to the common start, about
 ROOM: Final = 2  # more samples on a link than its delay asks for
 LATE, LATEST_S = 40.0, 60.0  # room for jitter: times its mean, of which one in 10¹⁷ is more, and [s]
 DRIVER: Final = """
 def stretch(crew, k, end, dt, log_every, instant):
     ledger = crew.ledger
     t = k * dt
-    while k < end:
-        {pursue}
-        if (crew.g0[0].robot.tick - 1) % log_every == 0:
-            {note}
-            ledger.times[ledger.sample] = t
-            ledger.sample += 1
-        k += 1
-        t = k * dt
-        if crew.stage is None:
-            {advance}
-        else:
-            {begin_step}
-            crew.stage.advance(t)
-            {end_step}
-        {deliver}
-        moves = False
-        {observe}
-        if moves:
-            ledger.ended = ledger.moves = True
-            return k
+    while ledger.moves or k < end:
+        if not ledger.moves:
+            {pursue}
+            if (crew.g0[0].robot.tick - 1) % log_every == 0:
+                {note}
+                ledger.times[ledger.sample] = t
+                ledger.sample += 1
+            k += 1
+            t = k * dt
+            if crew.stage is None:
+                {advance}
+            else:
+                {begin_step}
+                crew.stage.advance(t)
+                {end_step}
+            {deliver}
+            moves = False
+            {observe}
+            if moves:
+                ledger.moves = True
+                return k
+        ledger.moves = False
         {transmit}
         if instant:
             {deliver}
@@ -105,10 +109,10 @@ class Flown(Protocol):
         ...
 
 
-def stretches_of(flight: Flown) -> Stretches | None:
+def stretches_of(flight: Flown, *, to_start: bool = False) -> Stretches | None:
     """Compiled stretches of a flight, where they are possible and pay; else None: then it is flown as it is."""
     WORK[0] += plain_s(flight.plan)
-    return None if WORK[0] < PAYS_S or not possible(flight) else Stretches(flight)
+    return None if WORK[0] < PAYS_S or not possible(flight) else Stretches(flight, to_start=to_start)
 
 
 def plain_s(plan: Plan) -> float:
@@ -166,9 +170,12 @@ class Stretches:
     called_back: str = ""  # likewise for steps of laws, and changes of the formation
     tick: int  # tick of the present stretch of which the first half is done
     end: int  # last tick of the present stretch
+    moved: bool = False  # phases have moved on at the present tick, of which the rest of the first half is to be flown
 
-    def __init__(self, flight: Flown) -> None:
+    def __init__(self, flight: Flown, *, to_start: bool = False) -> None:
+        """`to_start`: no stretch goes on beyond the common start."""
         self._flight, self._case = flight, msgspec.json.encode(flight.plan.experiment)
+        self._to_start = to_start
         twins = flight.twin.twins
         network, rates = flight.network, flight.plan.experiment.rates
         says = network.says
@@ -196,17 +203,19 @@ class Stretches:
         """Whether the robots live in records now."""
         return self._image is not None
 
-    def begin(self, k: int, end: int) -> bool:
-        """Begin a stretch from tick `k`, of which the first half is done, to `end` at most; returns whether it pays."""
+    def begin(self, k: int) -> bool:
+        """Begin a stretch from tick `k`, of which the first half is done; returns whether it pays."""
         flight = self._flight
+        rates, duration_s = flight.plan.experiment.rates, flight.plan.experiment.duration_s
         longest = max(min(LONGEST, ROBOT_TICKS // len(flight.robots)), LEAST)
-        end = min(end, k + longest, self._next_leg())
+        soon = k * flight.dt + AHEAD_S
+        ends = (soon if np.isnan(flight.start_at) else flight.start_at) + duration_s
+        end = min(k + longest, self._next_leg(k), round(max(ends, soon) / flight.dt))
         if self._refused or k < self._paused_until or end - k < LEAST:
             return False
         if not all(_goes_on(robot, (k + 1) * flight.dt) for robot in flight.robots):
             return False
         ticks = end - k
-        rates = flight.plan.experiment.rates
         transmissions = ticks // round(rates.body_hz / rates.pose_hz) + ROOM
         samples = ticks // flight.log_every + ROOM
         self._ledger = ledger = Ledger(self._members, transmissions, samples, start=flight.start_at, lean=flight.lean)
@@ -239,11 +248,12 @@ class Stretches:
     def go(self, end: int) -> bool:
         """Fly on until the first half of tick `end` is done, of a stretch that has begun; returns False if it ended.
 
-        Raises TornError.
+        Not so far if a phase moves on: then `moved` says so. Raises TornError.
         """
         steps, flight, image, prepared = self._steps, self._flight, self._image, self._prepared
         assert image is not None
         assert prepared is not None
+        self.moved = False
         if steps.stage is None:
             words, samples = image.words.copy(), [array("d", way.samples) for way in self._ways]
         given = (self.tick, end, flight.dt, flight.log_every, flight.network.instant, steps.address)
@@ -251,7 +261,8 @@ class Stretches:
         if found >= 0:
             self.tick = found
             image.read([self._ledger])
-            return not self._ledger.ended
+            self.moved = self._ledger.moves and self._live(image, found * flight.dt)
+            return self.moved or not (self._ledger.ended or self._ledger.moves)
         if steps.stage is None:
             image.words[:] = words
             for way, before in zip(self._ways, samples, strict=True):
@@ -262,6 +273,33 @@ class Stretches:
             raise TornError
         self._refused = True  # flown plain; that tells an error
         return False
+
+    def _live(self, image: Image, t: float) -> bool:
+        """Phases move on at `t` [s]; returns False where more comes of it than a take-off or the common start."""
+        robots, twins = self._flight.robots, self._flight.twin.twins
+        image.read(part for each in robots for part in (each.lifecycle, each.now, each.now.state, each.landing))
+        moving = [row for row, robot in enumerate(robots) if not robot.is_steady(t)]
+        stays = self._to_start or self._itineraries
+        for life, lands_at in ((robots[row].lifecycle, robots[row].assignment.lands_at) for row in moving):
+            if not (life.climbing or (life.phase == AIRBORNE and not stays and lands_at == np.inf)):
+                return False
+        for row in moving:
+            robot, motion = robots[row], twins[row].motion
+            image.read([robot, robot.neighbours, *robot.neighbours.all, motion])
+            robot.live(t)
+            if robot.takes_off:
+                self._flight.twin.takeoff((row,), (robot.assignment.hover,))
+                robot.takes_off = False
+            image.write([robot, robot.lifecycle, robot.landing, motion])
+        return True
+
+    def order(self, give: Callable[[], object]) -> None:
+        """Let a conductor `give` orders, which robots get before the next tick."""
+        lives, ledger = [robot.lifecycle for robot in self._flight.robots], self._ledger
+        self.read(lives)
+        give()
+        ledger.start = self._flight.start_at
+        self.write([*lives, ledger])
 
     def read(self, things: Iterable[object] | None = None) -> None:
         """Read some objects of the robots as they are now, or all; changes of them are of no effect, but see `write`.
@@ -328,12 +366,17 @@ class Stretches:
         RECENT[self._case] = found = Prepared(rows, layout, driver(layout, len(rows), plan.names, often=often))
         return found
 
-    def _next_leg(self) -> int:
-        """Tick on which the next leg of a plan begins, or a later one; those of a decision around it are plain."""
+    def _next_leg(self, k: int) -> int:
+        """Tick on which the next leg of a plan begins, or a later one; those of a decision around it are plain.
+
+        `k`: present tick.
+        """
         flight, first = self._flight, sys.maxsize
         for robot in flight.robots:
             itinerary, begin = robot.goals.itinerary, robot.lifecycle.start_at
-            if itinerary is not None and robot.begun and itinerary.next_at < np.inf:
+            if itinerary is not None and not robot.begun:
+                first = min(first, k + round(AHEAD_S / flight.dt))
+            elif itinerary is not None and itinerary.next_at < np.inf:
                 first = min(first, int((begin + itinerary.next_at) / flight.dt) - 1)
         return first
 
@@ -358,10 +401,9 @@ class Stretches:
 
 def _goes_on(robot: Robot, t: float) -> bool:
     """Whether nothing happens to a robot, and its phase probably does not move on at `t` [s]: by its last state."""
-    life = robot.lifecycle
-    if life.moved or robot.takes_off or robot.lands or robot.stops or robot.causes or robot.hazards.under_way:
+    if robot.lifecycle.moved or robot.takes_off or robot.lands or robot.stops:
         return False
-    return (life.phase > READY or life.climbing) and robot.is_steady(t)
+    return not (robot.causes or robot.hazards.under_way) and robot.is_steady(t)
 
 
 def driver(crew: RecordLayout, groups: int, names: Sequence[str], *, often: bool) -> CompiledLoop:

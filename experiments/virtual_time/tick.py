@@ -19,10 +19,10 @@ from agents.vectors import Pose, Vector
 from experiments.virtual_time.records import MEASURES, numbers
 from twins.body import Twin
 
-WIDTH: Final = 19  # numbers of a robot in a sample
+WIDTH: Final = 20  # numbers of a robot in a sample
 PLACES: Final = {  # first place of each in those
     "position": (0, 3), "velocity": (3, 6), "yaw": (6, 7), "true_position": (7, 10), "true_yaw": (10, 11),
-    "goal": (11, 14), "setpoint": (14, 18), "error": (18, 19),
+    "goal": (11, 14), "setpoint": (14, 18), "error": (18, 19), "phase": (19, 20),
 }  # fmt: skip
 LEAN: Final = 3  # numbers of a true position alone
 SENT: Final = 10  # numbers of a transmission
@@ -196,7 +196,7 @@ class Ledger:
         samples[k + 7], samples[k + 8], samples[k + 9] = state.true_position
         samples[k + 11], samples[k + 12], samples[k + 13] = robot.goal
         samples[k + 14], samples[k + 15], samples[k + 16], samples[k + 17] = robot.setpoint
-        samples[k + 18] = robot.error
+        samples[k + 18], samples[k + 19] = robot.error, float(robot.lifecycle.phase)
 
     def note_law(self, stepping: Stepping, row: int) -> None:
         """Note what a law remembers and measures, as one row of `laws`."""

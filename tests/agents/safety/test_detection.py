@@ -389,7 +389,10 @@ class Standing(Watched):
         self.now.state = BodyState(**{**stands, **values})
         self.now.begin(self.t)
         self.filter.judge(self.now)
-        return self.preflight.check(self.now, missing, self.neighbours, self.health)
+        reason = self.preflight.check(self.now, missing, self.neighbours, self.health)
+        self.passes = self.preflight.passes(self.now, self.neighbours, self.health)
+        assert missing or not (reason and self.passes)
+        return reason
 
 
 SWAPPED = "it stands where G begins: addresses or markers are swapped"
@@ -415,6 +418,7 @@ def test_reason_why_a_drone_is_not_ready(what):
     values, reason = FAILURES[what]
     robot = Standing()
     assert not robot.check()
+    assert robot.passes
     assert robot.check(**values) == reason
     assert not robot.check()
     robot.health.offline_since = 0.5
@@ -441,6 +445,8 @@ def test_failure_that_lasts_ends_readiness():
     reason = robot.check(battery=0.1)
     times = [(1.0, reason), (1.0 + 0.9 * LOST_S, reason), (1.5, ""), (2.0, reason), (2.0 + LOST_S, reason)]
     assert [robot.preflight.lost(*each) for each in times] == [False, False, False, False, True]
+    assert not robot.check()
+    assert not robot.passes  # what failed is asked for at length until it is over
 
 
 @pytest.mark.parametrize(("x", "z", "clear"), [(0.28, 0.6, False), (0.28, 0.05, True), (0.35, 0.6, True)])

@@ -374,6 +374,14 @@ def test_stretches_of_legs_hazards_and_users_laws():
     assert len(faults) == 1
 
 
+def test_take_off_and_common_start_are_compiled():
+    """A flight without a plan is two stretches: from the first robot that is ready to the end, and the landing."""
+    for kind in ({"kind": "khepera4"}, {"kind": "crazyflie", "hover": 0.5}):
+        robots = {"A": RobotTable(**kind, start=[0.0, 0.0]), "B": RobotTable(**kind, start=[0.5, 0.0])}
+        log, ticks = same(follower(robots=robots, formation=Formation(links={"A > B": 0.5, "B > A": 0.5})))
+        assert ticks >= (1.0 - log.time[0] / 4.0) * log.ticks - 5  # of 4 s
+
+
 def test_law_outside_of_the_subset_is_flown_plain():
     _, ticks = same(follower(duration_s=1.0), change=lambda given: replace(given, law=Trying()))
     assert ticks == 0
