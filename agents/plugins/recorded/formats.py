@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Mapping, Sequence
-from itertools import pairwise
+from itertools import pairwise, takewhile
 from math import atan2, cos, hypot, isfinite, nan, radians, sin
 from typing import Final, NamedTuple
 
@@ -68,7 +68,7 @@ def read(text: str, body: str = "", up: str = "y") -> Curve:
             return Samples(_exported(lines, head, body, _vicon(lines, head, body)))
         if line.lower().startswith(MOTIVE_HEADER) and head > 1:
             return Samples(_exported(lines, head, body, _motive(lines, head, body, up)))
-    rows = _rows(lines)
+    rows = _rows(lines, body)
     if not rows:
         raise FormatError(f"the file holds no numbers; {FORMS}")
     first = rows[0][1]
@@ -84,28 +84,55 @@ def read(text: str, body: str = "", up: str = "y") -> Curve:
     return Samples(_samples(rows[1:], places, factors))
 
 
-def _rows(lines: Sequence[str]) -> Rows:
-    """Cells of the lines that hold any; a first line behind # is one if it names columns."""
+def _rows(lines: Sequence[str], body: str) -> Rows:
+    """Cells of the lines that hold any; the last line behind # that names columns is one, if none else does."""
     given = [(number, line.strip()) for number, line in enumerate(lines, 1) if line.strip()]
-    if given and given[0][1].startswith("#") and {"x", "y"} <= set(re.split(r"[#,;\s]+", given[0][1].lower())):
-        given[0] = given[0][0], given[0][1].lstrip("# ")
+    comments = [(number, line.strip("# ")) for number, line in takewhile(lambda each: each[1].startswith("#"), given)]
     given = [(number, line) for number, line in given if not line.startswith("#")]
-    first = given[0][1] if given else ""
-    sign = next((sign for sign in (";", ",", "\t") if sign in first), None)
-    rows = [(number, [cell.strip().strip('"') for cell in line.split(sign)]) for number, line in given]
+    if given and _is_number(_split(given[0][1], _sign(given[0][1]))[0]):
+        heads = [(number, line) for number, line in comments if {"t", "x", "y"} <= _known(line, body)]
+        given = [*heads[-1:], *given]
+    sign = _sign(given[0][1]) if given else None
+    rows = [(number, _split(line, sign)) for number, line in given]
     if sign == ";":  # decimal commas
         rows = [(number, [cell.replace(",", ".") for cell in cells]) for number, cells in rows]
     return [(number, cells[:-1] if cells[-1] == "" else cells) for number, cells in rows]
 
 
+def _sign(line: str) -> str | None:
+    return next((sign for sign in (";", ",", "\t") if sign in line), None)
+
+
+def _split(line: str, sign: str | None) -> list[str]:
+    return [cell.strip().strip('"') for cell in line.split(sign)]
+
+
+def _known(line: str, body: str) -> set[str]:
+    """Columns that a line names."""
+    found = (_column(name, body) for name in _split(line, _sign(line)))
+    return {column.name for column in found if column}
+
+
+class _Column(NamedTuple):
+    name: str  # one of `NAMES`
+    factor: float  # metres, seconds or radians in its unit
+    owner: str  # object in front of the name, such as `CF01` or `CF01_pose`
+
+
 def _columns(header: tuple[int, list[str]], body: str) -> tuple[dict[str, int], dict[str, float]]:
     """Number of each column that is known, and the factor of its unit."""
     number, names = header
+    known = [(place, column) for place, name in enumerate(names) if (column := _column(name, body))]
+    owners = dict.fromkeys(column.owner for _, column in known if column.name == "x")
+    taken = [owner for owner in owners if not body or f"_{_bare(body)}_" in f"_{owner}_"]
+    if len(taken) > 1:
+        several = [owner for owner in taken if owner]
+        hint = f'write body = "{several[0]}", or another'
+        raise FormatError(f"line {number}: it has places of {', '.join(several)}; {hint}")
     places, factors = dict[str, int](), dict[str, float]()
-    for place, name in enumerate(names):
-        found = _column(name.lstrip("%"), body)
-        if found is not None and found[0] not in places:
-            places[found[0]], factors[found[0]] = place, 1e-9 if name == "%time" else found[1]
+    for place, column in sorted(known, key=lambda each: each[1].owner not in taken):
+        if column.name not in places and (column.name == "t" or column.owner in (*taken, "")):
+            places[column.name], factors[column.name] = place, column.factor
     if missing := [name for name in ("t", "x", "y") if name not in places]:
         of_body = f" of {body}" if body else ""
         hint = f"name the columns t, x, y (, z, yaw), with units such as x_mm; this line has {', '.join(names)[:80]}"
@@ -113,22 +140,30 @@ def _columns(header: tuple[int, list[str]], body: str) -> tuple[dict[str, int], 
     return places, factors
 
 
-def _column(name: str, body: str) -> tuple[str, float] | None:
-    """Column of a name, and the factor of its unit; None for a name of something else."""
-    bare = re.sub(r"[./:]+", "_", name.strip()).strip("_")
-    if body and bare.startswith(f"{body}_"):
-        bare = bare[len(body) + 1 :]
-    bare, factor = bare.lower(), 1.0
-    with_unit = UNIT.fullmatch(bare)
-    if with_unit and bare not in COLUMNS:
-        bare = with_unit[1].rstrip("_")
+def _bare(name: str) -> str:
+    return re.sub(r"[./:]+", "_", name.strip()).strip("_ ")
+
+
+def _column(name: str, body: str) -> _Column | None:
+    """Column of a name; None for a name of something else."""
+    if name == "%time":
+        return _Column("t", 1e-9, "")
+    bare = _bare(name.lstrip("%").removesuffix("[]"))
+    owner, factor = "", 1.0
+    if body and bare.startswith(f"{_bare(body)}_"):
+        bare, owner = bare[len(_bare(body)) + 1 :], _bare(body)
+    with_unit = UNIT.fullmatch(bare.lower())
+    if with_unit and bare.lower() not in COLUMNS:
+        bare = bare[: len(with_unit[1])].rstrip("_")
         unit = next(filter(None, with_unit.groups()[1:]))
         if unit not in UNITS and unit not in UNITS_OF_ANGLES:
             return None
         factor = UNITS.get(unit) or UNITS_OF_ANGLES[unit]
-    if of_ros := re.search(r"(?:position|orientation)_[xyzw]$", bare):
-        bare = of_ros[0]
-    return (COLUMNS[bare], factor) if bare in COLUMNS else None
+    if of_euroc := re.fullmatch(r"([pq])_RS(?:_R)?_([wxyz])", bare):
+        bare = f"{of_euroc[1]}_{of_euroc[2]}"
+    elif of_ros := re.fullmatch(r"(.*)_((?:position|orientation)_[xyzw])", bare):
+        owner, bare = f"{owner}_{of_ros[1]}".strip("_"), of_ros[2]
+    return _Column(COLUMNS[bare.lower()], factor, owner) if bare.lower() in COLUMNS else None
 
 
 def _samples(rows: Rows, places: Mapping[str, int], factors: Mapping[str, float]) -> list[TimedPose]:

@@ -37,6 +37,8 @@ Frame,Time (Seconds),X,Y,Z,W,X,Y,Z,,X,X
 1,0.100000,,,,,,,,,,5
 2,0.200000,0,0,0,1,200,300,-200,0.1,1,5
 """
+NAMES = [f"/CF0{n}/pose/position/{axis}" for n in (1, 2) for axis in "xy"]
+TOPICS = f"time,{','.join(NAMES)}\n0,0,1,5,6\n1,1,1,6,6\n"  # as PlotJuggler writes them
 
 
 def piece(duration, **axes):
@@ -61,6 +63,15 @@ def content(text):
         ("time_s,CF01_x_m,CF01_y_m,CF02_x_m,CF02_y_m\n0,0,0,5,5\n1,1,1,6,6\n", "CF02", {0.5: (5.5, 5.5, nan, nan)}),
         ("# timestamp tx ty tz qx qy qz qw\n1e9 0 0 1 0 0 0 1\n1000000001.0 1 0 1 0 0 1 0\n", "",
          {0.0: (0, 0, 1, 0), 1.0: (1, 0, 1, pi)}),
+        ("# recorded\n# timestamp tx ty tz qw qx qy qz\n0 0 0 1 0 0 0 1\n1 1 0 1 1 0 0 0\n", "",
+         {0.0: (0, 0, 1, pi), 1.0: (1, 0, 1, 0)}),
+        ("#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z [],b_w_x\n"
+         "1403636580838555648,0,0,1,0,0,0,1,9\n1403636581838555648,1,0,1,1,0,0,0,9\n", "",
+         {0.0: (0, 0, 1, pi), 1.0: (1, 0, 1, 0)}),
+        (TOPICS, "CF02", {0.5: (5.5, 6, nan, nan)}),
+        (TOPICS, "/CF01/pose", {0.5: (0.5, 1, nan, nan)}),
+        ("t,x,y,CF01_x,CF01_y\n0,0,0,5,5\n1,0,0,6,6\n", "CF01", {0.5: (5.5, 5.5, nan, nan)}),
+        ("t,x,y\n0,0,0\n1,1,1\n", "CF01", {0.5: (0.5, 0.5, nan, nan)}),
         (VICON, "drone", {0.0: (0.1, 0.2, 0.3, radians(90)), 0.01: (0.11, 0.2, 0.3, radians(90.5))}),
         (MOTIVE, "cf 1", {0.0: (0.1, 0.2, 0.3, radians(90)), 0.1: (0.15, 0.2, 0.3, radians(45))}),
         (f"{HEADER}\n{piece(2, x=(0, 1), yaw=(0.5,))}\n{piece(1, x=(2, 1, -0.5), y=(0, 0, 0, 1), yaw=(0.5,))}\n", "",
@@ -87,6 +98,7 @@ def test_formats_hold_these_poses(text, body, poses):
         (f"{HEADER}\n1,2,3\n", "line 2: 3 numbers; a piece is a duration and 32"),
         (f"{HEADER}\n{piece(0)}\n", "line 2: the duration 0 s; give a positive one"),
         (f"{HEADER}\n", "no piece"),
+        (TOPICS, 'line 1: it has places of CF01_pose, CF02_pose; write body = "CF01_pose", or another'),
         (VICON, 'line 3: it has drone, wand; write body = "drone"'),
         (VICON.replace("100\n", "\n", 1), "no rate stands above"),
         (VICON.replace("TX", "MX"), "line 4: no columns TX"),
