@@ -260,22 +260,30 @@ def _parsed(axis: Axis, value: str, read: Document) -> Override:
 def _has(case: str, plan: Plan, parsed: Override) -> bool:
     """Whether a case has what is changed: a parameter of a plug-in if it has chosen that plug-in, and no `--set` of the
     case has the last word."""
-    path = parsed.path
+    path, value = parsed.path, parsed.value
     if parsed.case not in (None, case):
         return False
-    for end in range(1, len(path)):
-        if group_of(path[:end]) is not None:
-            choice: Any = plan.experiment
-            for step in path[:end]:
-                choice = (
-                    getattr(choice, step)
-                    if isinstance(choice, msgspec.Struct) and isinstance(step, str)
-                    else choice[step]
-                )
-            if path[end] == "kind" or not isinstance(choice, dict) or path[end] not in choice:
-                return path[end] == "kind"
-            return len(path) > end + 1 or bool(choice[path[end]] == parsed.value)
-    return True
+    found: Any = plan.experiment
+    for end, step in enumerate(path):
+        in_choice = end > 0 and group_of(path[:end]) is not None
+        if in_choice and step == "kind":
+            return True
+        if isinstance(found, msgspec.Struct) and isinstance(step, str):
+            found = getattr(found, step, value)
+        elif isinstance(found, dict):
+            if in_choice and step not in found:
+                return False
+            found = found.get(step, value)
+        else:
+            return not in_choice
+    return found == value or not (_is_plain(found) and _is_plain(value))
+
+
+def _is_plain(value: object) -> bool:
+    """Whether a value is read from a file as it stands there: a word, a number, or a list of numbers."""
+    if isinstance(value, list):
+        return all(isinstance(each, int | float) for each in value)
+    return isinstance(value, int | float | str)
 
 
 def _renamed(problem: Problem, values: Mapping[Axis, str]) -> Problem:

@@ -84,10 +84,18 @@ def test_loss_is_environment_and_threshold_is_chosen(triangle_document):
     assert met == {frozenset(("channel.loss", "cases.event.channel.delay_s"))}
 
 
-def test_set_of_a_case_is_not_swept():
-    fixed = 'cases.event.trigger={ kind = "send-on-delta", threshold = 0.03 }'
-    plan = planned(load("triangle", fixed), "trigger.threshold=0.01,0.02", cases=["event"], settings=[fixed])
-    assert [dict(cell.parameters) for cell in plan] == [{}, {}]
+@pytest.mark.parametrize(
+    ("fixed", "axis", "swept"),
+    [
+        ('trigger={ kind = "send-on-delta", threshold = 0.03 }', "trigger.threshold=0.01,0.02", [{}]),
+        ("channel.loss=0.3", "channel.loss=0.1,0.2", [{"channel.loss": 0.1}, {"channel.loss": 0.2}]),
+        ("robots.KH01.start=[0.1,0.1]", "robots.KH01.start=[0.0,0.0]", [{"robots.KH01.start": [0.0, 0.0]}]),
+    ],
+)
+def test_set_of_a_case_is_not_swept(fixed, axis, swept):
+    fixed = f"cases.event.{fixed}"
+    plan = planned(load("triangle", fixed), axis, cases=["event"], settings=[fixed])
+    assert [dict(cell.parameters) for cell in plan] == [*swept, {}]
 
 
 def test_parameter_has_the_unit_of_its_plugin(tmp_path, triangle_document):
