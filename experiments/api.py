@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from agents.body.byte_stream import MalformedStream
     from agents.body.capture_reader import CaptureFrame, CaptureReader, MeasuredPose
     from agents.body.device_address import DeviceAddress
+    from agents.body.device_locks import Claims
     from agents.body.interface import Body, BodyEntry, BodyError, BodyFault, BodyRequest, BodyState, call_all
     from agents.body.kinds import KINDS, Flight, Holonomic, Kind, Steered, Wheels
     from agents.formation.link import Link
@@ -73,7 +74,8 @@ __all__ = [  # noqa: RUF022 - by subject, as in docs/python.md
     "TriggerView", "Predictor", "Avoidance", "measure_gap", "EngineFactory", "PointMassEngine", "moving_models",
     # kinds and bodies
     "Kind", "KINDS", "Wheels", "Steered", "Holonomic", "Flight", "Ground",
-    "Body", "BodyRequest", "BodyState", "BodyError", "BodyEntry", "BodyFault", "DeviceAddress", "call_all",
+    "Body", "BodyRequest", "BodyState", "BodyError", "BodyEntry", "BodyFault", "DeviceAddress", "Claims",
+    "call_all",
     # readers of motion capture
     "CaptureReader", "CaptureFrame", "MeasuredPose", "MalformedStream",
     # vectors

@@ -29,6 +29,9 @@ _GROUPS: Final[Mapping[tuple[str | int | type, ...], str]] = {
     ("avoidance",): registry.AVOIDANCES,
     ("world", "engine"): registry.ENGINES,
 }
+PLACES: Final = {  # a key for each group
+    group: ".".join(part for part in path if isinstance(part, str)) for path, group in reversed([*_GROUPS.items()])
+}
 _METRICS: Final = (("criteria", int, "metric"), ("metrics", int))  # may be classes in files, too
 _NAMING: Final = (*_GROUPS, *_METRICS)
 

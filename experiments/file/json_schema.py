@@ -117,20 +117,25 @@ def _choice(group: str, definitions: dict[str, Any]) -> dict[str, Any]:
     bare, tables = [], []
     for name in registry.names(group):
         try:
-            reference, parts = _parameters(group, name)
+            own = table_of(group, name, definitions)
         except registry.PluginError:
             continue
-        own = parts.pop(reference["$ref"].rpartition("/")[2])
-        definitions.update({part: _draft7(each) for part, each in parts.items()})
-        own = _draft7(own)
-        if not own.get("required"):
+        if own["required"] == ["kind"]:
             bare.append(name)
-        own["properties"] = {"kind": {"const": name}, **own.get("properties", {})}
-        own["required"] = ["kind", *own.get("required", [])]
         tables.append(own)
     beside = {"type": "string", "pattern": f"^{files.CHOICE}$", "description": "a class in a file beside this one"}
     tables.append({"type": "object", "properties": {"kind": beside}, "required": ["kind"]})
     return {"anyOf": [*([{"enum": bare}] if bare else []), beside, *tables]}
+
+
+def table_of(group: str, name: str, definitions: dict[str, Any]) -> dict[str, Any]:
+    """The table of a plug-in, its parts among the `definitions`; raises PluginError if it cannot be used."""
+    reference, parts = _parameters(group, name)
+    own = _draft7(parts.pop(reference["$ref"].rpartition("/")[2]))
+    definitions.update({part: _draft7(each) for part, each in parts.items()})
+    own["properties"] = {"kind": {"const": files.plain(name)}, **own.get("properties", {})}
+    own["required"] = ["kind", *own.get("required", [])]
+    return own
 
 
 def _parameters(group: str, name: str) -> tuple[dict[str, Any], dict[str, Any]]:

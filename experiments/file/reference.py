@@ -11,16 +11,18 @@ import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
+from pathlib import Path
 from typing import Any, Final
 
 import msgspec
 
 from agents.body.kinds import KINDS, Kind
+from agents.plugins import files, registry
 from agents.plugins.registry import split
 from experiments.catalogue.index import FOLDER
 from experiments.definition.experiment import Experiment
-from experiments.file.choices import fields_of, group_of, struct_of
-from experiments.file.json_schema import CASE, described, map_children
+from experiments.file.choices import PLACES, fields_of, group_of, struct_of
+from experiments.file.json_schema import CASE, described, map_children, table_of
 
 NONE: Final[Mapping[str, object]] = {}
 _NAMES: Final = {  # tables with names as keys, and an example of such a name
@@ -89,6 +91,29 @@ def matching(asked: str) -> list[Entry]:
         found = sorted(ends, key=lambda entry: len(entry.words))
     tables = tuple(f"{entry.key}{sign}" for entry in found for sign in ".(")
     return found + [each for each in entries() if each.key.startswith(tables) and each not in found]
+
+
+def in_file(choice: str) -> list[Entry]:
+    """Entries of a class in a file of the current folder.
+
+    Raises PluginError if there is no such file or class, or it is no plug-in with parameters.
+    """
+    try:
+        name, _ = files.adopt(choice, Path.cwd())
+    except ValueError as error:
+        raise registry.PluginError(str(error)) from None
+    faults = []
+    for group in registry.STRUCTS:
+        definitions: dict[str, Any] = {}
+        try:
+            table = table_of(group, name, definitions)
+        except registry.PluginError as fault:
+            faults.append(fault)
+            continue
+        return list(_keys_below(PLACES[group], "", {"anyOf": [_inlined(table, definitions)]}))
+    bases = ", ".join(registry.BASES[group].partition(":")[2] for group in registry.STRUCTS)
+    none = registry.PluginError(f"{choice} must be a class that inherits from one of {registry.FACE}'s {bases}")
+    raise next((each for each in faults if "must be a class" not in str(each)), none)
 
 
 def unit(asked: str, experiment: Experiment) -> str:

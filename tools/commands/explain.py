@@ -24,7 +24,9 @@ LISTED: Final = 6  # keys about a word that is no key
 
 @app.command(epilog=example("explain", "explain disturbance.hover_jitter", "explain plan.circle"))
 def explain(
-    key: Annotated[str, Argument(help="such as disturbance.hover_jitter, safety, circle; none: all at the top")] = "",
+    key: Annotated[
+        str, Argument(help="such as disturbance.hover_jitter, circle, my_laws.py:Spring; none: all at the top")
+    ] = "",
     *,
     schema: Annotated[bool, Option("--schema", help="Print the JSON schema of the experiment file instead.")] = False,
     as_json: AsJson = False,
@@ -39,6 +41,8 @@ def explain(
         print_json(json_schema.schema())
         return 0
     found = reference.matching(key) if key else reference.tables()
+    if files.is_choice(key):
+        found = reference.in_file(key)
     metric = {short_name(name): each for name, each in (FIGURES | known_metrics()).items()}.get(short_name(key.lower()))
     if not found and metric is not None:
         print_result(
@@ -58,8 +62,6 @@ def explain(
             hint = near
         if key.lower() in {name.split("_")[0] for name in FIGURES}:
             hint, listed = "a metric of a run: `./zenpark docs`, page 'Metrics and CSV columns'", []
-        if files.is_choice(key):
-            hint, listed = "classes in files are not explained: their parameters stand in the file", []
         warn([f"nothing in the experiment file is named {key!r}; {'keys about it:' if listed else hint}"])
         for entry in listed:
             print(textwrap.shorten(f"  {entry.key}  {entry.text}", WIDEST, placeholder=" ..."), file=sys.stderr)

@@ -60,6 +60,37 @@ def test_key_is_found_as_users_write_it(asked, first):
     assert len(keys) == len(set(keys))
 
 
+PURSUIT = '''
+from typing import Annotated
+from msgspec import Meta
+from zenpark import Law
+
+
+class Pursuit(Law, frozen=True):
+    """Goes after its neighbour."""
+
+    gain: Annotated[float, Meta(ge=0.0, description="gain of the pursuit [1/s]")] = 0.5
+
+
+class Other: ...
+'''
+
+
+def test_class_of_a_file_is_explained(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("pursuit.py").write_text(PURSUIT, "utf-8")
+    told = invoke("explain", "pursuit.py:Pursuit").stdout
+    for part in ("Goes after its neighbour.", "[formation]\n", "gain of the pursuit [1/s] [≥ 0.0, default: 0.5]"):
+        assert part in told
+    for choice, fault in {
+        "pursuit.py:Other": "Law, Planner",
+        "pursuit.py:Third": "has no Third",
+        "a.py:A": "a.py",
+    }.items():
+        with pytest.raises(registry.PluginError, match=fault):
+            reference.in_file(choice)
+
+
 @pytest.mark.parametrize(
     ("words", "code", "parts"),
     [
