@@ -175,6 +175,11 @@ def read(model: str, what: str) -> LearnedModel:
     try:
         session = ort.InferenceSession(b64decode(model), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # noqa: BLE001 - its own exceptions have no common base
+        if "External data" in str(error):
+            raise PluginError(
+                f"the {what} needs a file with its weights, and this has them in a second one, as PyTorch writes it "
+                "since 2.9; export it with external_data=False"
+            ) from None
         raise PluginError(f"the {what} cannot use its file: {str(error).splitlines()[0]}") from None
     takes, gives = session.get_inputs(), session.get_outputs()
     plain = len(takes) == len(gives) and len(takes) in (1, 2) and all(map(_is_row, takes))

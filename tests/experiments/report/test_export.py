@@ -5,6 +5,7 @@ import shutil
 from types import SimpleNamespace
 from unittest.mock import Mock
 
+import networkx as nx
 import numpy as np
 import pytest
 from PIL import Image
@@ -123,6 +124,7 @@ def test_what_links_ask_for_besides_distances_is_told():
     made = structure(run.trace, run.metrics)
     ends = [made["links"][name].tolist() for name in ("receiver", "sender")]
     assert (ends, made["adjacency"].tolist()) == ([[2.0], [1.0]], [[0.0, 0.0], [1.0, 0.0]])
+    assert [*nx.from_numpy_array(made["adjacency"].T, create_using=nx.DiGraph).edges] == [(0, 1)]
     assert made["links"]["relative"][0, :2].tolist() == [0.8, 0.1]  # KH02 from KH01
 
 

@@ -118,6 +118,14 @@ def test_what_is_no_policy_is_refused(tmp_path, monkeypatch):
         policy.load("not cached")
 
 
+def test_weights_in_a_second_file_are_explained(tmp_path):
+    file = tmp_path / "two.onnx"
+    made = onnx.load_from_string(learned_bytes(16, 2))
+    onnx.save(made, str(file), save_as_external_data=True, location="two.onnx.data", size_threshold=0)
+    with pytest.raises(PluginError, match="external_data=False"):
+        policy.load(b64encode(file.read_bytes()).decode())
+
+
 def test_an_action_in_one_column_is_read():
     """A network of scikit-learn, as skl2onnx 1.20 writes it, declares one number and gives two rows of one."""
     made = onnx.load_from_string(learned_bytes(16, 2, weights=((1.0, 0.0), *[(0.0, 2.0)] * 15)))
