@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
+from types import SimpleNamespace
 from typing import Any, Self
 from unittest import mock
 
@@ -126,6 +127,8 @@ class Token(Mute):
 class Attentive:
     """A router that always answers."""
 
+    heard = True
+
     def __init__(self, *_: object) -> None: ...
 
     @staticmethod
@@ -140,6 +143,7 @@ class Session(_Closing):
         self._net = net
         self.zid = lambda: "f00d"
         self.liveliness = lambda: self
+        self.info = SimpleNamespace(declare_transport_events_listener=lambda *_, **__: Mute())
         self.declare_publisher = lambda *_, **__: Mute()
 
     def declare_subscriber(self, key: str, handler: object = None, **_: object) -> Channel:

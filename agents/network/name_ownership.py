@@ -17,6 +17,7 @@ from math import inf
 from typing import Final
 
 import zenoh
+from zenoh.handlers import Callback
 
 from agents.clock import uptime
 from agents.errors import ExplainedError
@@ -137,30 +138,29 @@ def confirm_ownership(
 
     One answer is not enough: a link that is lost ends its questions as an answer does, and a process that takes the
     name may be between its two rounds. No other owner must be seen for `SETTLE_S`. One that is seen may still give way
-    to the claim of this process, for `vanish_s`. `pause` ends the wait when it is set. The tokens of the session
-    are declared; Zenoh declares them again after it was cut off.
+    to the claim of this process, for `vanish_s`, also while no answer comes any more. `pause` ends the wait when it is
+    set. The tokens of the session are declared; Zenoh declares them again after it was cut off.
 
     Raises NameTaken if another process owns one of the names, and network.Unreachable if `pause` was set before that
     was known; without a router the wait has no limit.
     """
     own_id = str(session.zid())
     free = taken = inf
+    others: list[str] = []
     while not pause.is_set():
         linked = network.connected(session)
         found = [tokens_of(session, key) for key in alive]
         now = time.monotonic()
         if not linked or None in found or not network.connected(session):
             free = inf
-            note(False)
-        elif others := [
+        elif named := [
             key
             for key, tokens in zip(alive, found, strict=True)
             if any(Keys.life_of(token) not in (None, own_id) for token in tokens or ())
         ]:
+            others = named
             free, taken = inf, min(taken, now)
             note(True)
-            if now - taken > timing.vanish_s:
-                raise NameTaken(", ".join(others))
         elif not all(found):  # an owner that was seen may still be there
             free = inf
         else:
@@ -168,6 +168,8 @@ def confirm_ownership(
             note(False)
             if now - free > SETTLE_S:
                 return
+        if now - taken > timing.vanish_s:
+            raise NameTaken(", ".join(others))
         pause.wait(timing.retry_s)
     raise network.Unreachable("asked to end before it was known whether the name has another owner")
 
@@ -181,6 +183,9 @@ class OwnershipCheck:
         self._timing = timing
         self.awake_at = uptime()  # last run of the process [s]
         self.linked = True  # whether the session had a router, or a neighbour in a mesh, at the last look
+        self._lost = False  # True if it had none, at any time since a look at which it was linked
+        self._neighbours: set[str] = set()  # routers, or neighbours in a mesh, by their ids
+        self._listener: zenoh.TransportEventsListener[None] | None = None
         self.contested = False  # True if the last answer named another owner, which may still give way
         self._taken = ""
         self._asking: threading.Thread | None = None
@@ -210,9 +215,26 @@ class OwnershipCheck:
         return self.awake_at - last >= self._stood_s
 
     def check_return(self, session: zenoh.Session) -> bool:
-        """Whether the session is linked again after a look at which it was not: the names may be lost since."""
-        before, self.linked = self.linked, network.connected(session)
-        return self.linked and not before
+        """Whether the session is linked again after it was not: the names may be lost since.
+
+        A link that was cut for longer than the lease of this end is closed and opened again within milliseconds of its
+        return, thus between two looks.
+        """
+        if self._listener is None:
+            callback = Callback(self._follow_links, indirect=False)
+            self._listener = session.info.declare_transport_events_listener(callback, history=True)
+        self.linked = network.connected(session)
+        self._lost |= not self.linked
+        if back := self._lost and self.linked:
+            self._lost = False
+        return back
+
+    def is_contested(self, session: zenoh.Session) -> bool:
+        """As `contested`; a check begins if the session is linked again. Calls nothing of Zenoh, which may hang."""
+        if self._lost and self._neighbours:
+            self._lost = False
+            self.begin(session)
+        return self.contested
 
     def wait_while_checking(self, session: zenoh.Session, ended: Callable[[], bool]) -> bool:
         """Wait while a check runs; one begins if the process stood still since the last call, or was cut off until now.
@@ -232,6 +254,14 @@ class OwnershipCheck:
 
     def end(self) -> None:
         self._over.set()
+
+    def _follow_links(self, event: zenoh.TransportEvent) -> None:
+        """Notes the loss of the last link, in the receiving thread."""
+        if event.kind == zenoh.SampleKind.PUT:
+            self._neighbours.add(str(event.transport.zid))
+        else:
+            self._neighbours.discard(str(event.transport.zid))
+            self._lost |= not self._neighbours
 
     def _note(self, contested: bool) -> None:
         self.contested = contested
@@ -267,6 +297,7 @@ class NameKeeper:
         try:
             self._owned = claim(session, alive, began=self._began, endpoints=endpoints, stop=stop, timing=self._timing)
             self.ownership.check_standstill()
+            self.ownership.check_return(session)
         except NameTaken as taken:
             raise NameTaken(
                 f"{self._owners_text(taken)}: a robot of this name is on the network already; end it first "

@@ -281,6 +281,11 @@ class RouterWatch:
         self._arrived = 0
         self._answers = 0  # count since the silence began
 
+    @property
+    def heard(self) -> bool:
+        """Whether an answer has come since the silence began; the first may be the end of a link."""
+        return self._answers > 0
+
     def silent_since(self, t: float, arrived: int = 0) -> float:
         """Begin [s] of the silence of the router, or of the loss of the last link; infinity while it answers.
 

@@ -67,7 +67,10 @@ class Descent:
         longest_s = ceiling / timing.slowest  # [s] landing: what still descends after a limit would fall
         self.limit_s = max(timing.landing_s, longest_s)  # [s] longest landing
         down_s = max(DOWN_S, longest_s)
-        self.watchdog = Watchdog(body, self._everyone, alarm=alarm, silence_s=silence_s, down_s=down_s)
+        self.watchdog = Watchdog(
+            body, self._everyone, alarm=alarm, silence_s=silence_s, down_s=down_s,
+            displaced=lambda: keeper.ownership.is_contested(self.session),
+        )  # fmt: skip
 
     def await_ownership(self) -> bool:
         """Whether the process was suspended or cut off until now; if so, it has waited until its names were certain.
@@ -78,16 +81,16 @@ class Descent:
         learns that they belong to another one. One that is cut off again holds and lands by its decisions.
         """
         ownership, session = self._keeper.ownership, self.session
-        stood = ownership.check_standstill()
         if self.watchdog.tripped:  # the watchdog handles a loop that hangs
             return False
+        stood = ownership.check_standstill()
         if ownership.check_return(session) or stood:
             ownership.begin(session)
         elif self._keeper.is_owner() or not ownership.linked:
             return False
         limits, drives = self._limits, self._on_wheels
         began, self._keeper.hands_off = self._ticks.elapsed(), True
-        while not self._keeper.is_owner() and (stood or network.connected(session)):
+        while not self._keeper.is_owner() and (stood or ownership.contested or network.connected(session)):
             waited = 0.0 if ownership.contested else self._ticks.elapsed() - began  # else the other owner drives them
             if waited > limits.offline_s or (waited > ANSWER_S and self.reason_to_end() is not None):
                 what = "stood still" if stood else "was cut off"

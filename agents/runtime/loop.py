@@ -243,6 +243,8 @@ class Runtime:
             self._wait(ticks.until_next())
             if self._cut_off:  # most stops come during that sleep
                 self._yield_after_stop()
+            if ticks.next >= self._router_due:  # a check of the router costs as much as a law
+                self._look_for_router(ticks.next)
             if self._descent.await_ownership():
                 continue
             missed = ticks.begin()
@@ -307,8 +309,6 @@ class Runtime:
 
     def _receive(self, t: float) -> None:
         health = self.health
-        if t >= self._router_due:  # a check of the router costs as much as a law
-            health.offline_since = self._cut_off_since(t)
         for _, stands in self._conductor.changes() if self._conductor.waiting else ():
             health.conductor_lost_since = inf if stands else min(health.conductor_lost_since, t)
         self._neighbours.deliver(t, self._utc)
@@ -454,13 +454,13 @@ class Runtime:
         self.health.mark_resumed(self.ticks.t, slept)
         print(f"{', '.join(self._names)}: stood still for {slept:.1f} s; holding", flush=True)
 
-    def _cut_off_since(self, t: float) -> float:
-        """Time [s] since which no router answers; infinity while one does."""
-        self._router_due = t + ROUTER_S
-        silent_since = self._router.silent_since(t, self._neighbours.arrived)
-        if self._descent.asked_at - self.ticks.zero < self.health.offline_since < inf == silent_since:
-            self.keeper.ownership.begin(self._session)  # the router is back
-        return silent_since
+    def _look_for_router(self, t: float) -> None:
+        """Notes since when no router answers; the first sign of a silent one begins the check of the names."""
+        health, router = self.health, self._router
+        before, health.offline_since = health.offline_since, router.silent_since(t, self._neighbours.arrived)
+        self._router_due = t + ROUTER_S if health.offline_since == inf else t
+        if router.heard and self._descent.asked_at - self.ticks.zero < before < inf:
+            self.keeper.ownership.begin(self._session)
 
     def _leave_formation(self, why: str) -> None:
         """Removes the robots from the formation while their loop hangs, or is over; called by the watchdog's thread."""

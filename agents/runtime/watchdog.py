@@ -39,10 +39,11 @@ class Watchdog:
         silence_s: float = SILENCE_S,  # longest time without a beat [s]
         down_s: float = DOWN_S,  # time from then until the motors are cut [s]
         end: Callable[[int], object] | None = None,  # ends the process with an exit code
+        displaced: Callable[[], bool] = lambda: False,  # whether another process drives the body: it is left alone
     ) -> None:
         self.tripped = ""  # why the robots were ordered to land; empty before, and after `forgive`
         self._body, self._rows, self._alarm = body, rows, alarm
-        self._end = end or os._exit
+        self._end, self._displaced = end or os._exit, displaced
         self.down_s, self._silence_s = down_s, silence_s
         self._beats = 0
         self._over = threading.Event()
@@ -89,13 +90,15 @@ class Watchdog:
                 counted, since = self._beats, looked
                 hung = 0.0
                 continue
+            displaced = self._displaced()
             if looked - since < self._silence_s:
                 continue
             if not hung:
                 hung = again = looked
+            if not self.tripped and not displaced:
                 self.tripped = f"its control loop hangs: no tick for {looked - since:.1f} s"
                 self.call_for_help(self.tripped)
-            if looked >= again:
+            if looked >= again and not displaced:
                 again = looked + AGAIN_S
                 self._call_in_thread("land", lambda: self._body.land(self._rows))
             if looked - hung > self.down_s:
@@ -104,8 +107,9 @@ class Watchdog:
 
     def _abort(self) -> None:
         """Cuts the motors and ends the process; the watchdog of the device and the launcher do the rest."""
-        self._call_in_thread("stop", lambda: self._body.stop(self._rows))
-        self._at_work["stop"].join(CUT_S)
+        if not self._displaced():
+            self._call_in_thread("stop", lambda: self._body.stop(self._rows))
+            self._at_work["stop"].join(CUT_S)
         if not self._over.wait(CUT_S):  # time for messages to leave the process
             self._end(HUNG)
 

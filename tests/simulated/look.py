@@ -96,7 +96,8 @@ class Look:
             life, hazards = runtime.robots[row].lifecycle, runtime.robots[row].hazards
             present, level = hazards.present, hazards.level
             held = present != 0 and any(present >> each & 1 and level[each] == Outcome.HOLD for each in HOLDING)
-            governed = not (runtime.keeper.hands_off or runtime.watchdog.tripped)
+            keeper = runtime.keeper
+            governed = not (keeper.hands_off or keeper.ownership.contested or runtime.watchdog.tripped)
             yield Seen(
                 name, process, kinds[name], self.before(name, process, life.phase), life.phase, hazards.worst(), held,
                 governed, life.reason, runtime._utc + life.start_at - EPOCH, self.world.true.get(name), runtime, row,

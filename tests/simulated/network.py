@@ -16,7 +16,7 @@ import zenoh
 
 from tests.simulated.entities import Left, Publisher, Query, Replies, Subscriber, Token
 from tests.simulated.kernel import Task, block, current, preempt
-from tests.simulated.links import LATENCY_S, Link, Node, Sample, match
+from tests.simulated.links import DELETE, LATENCY_S, PUT, Link, Node, Sample, match
 
 SHAKE_S: Final = 0.003  # time to open a link
 LOOK_S: Final = 0.01  # pause of two looks whether an end that is cut off, or frozen, answers at last
@@ -305,12 +305,14 @@ class Session(Node):
         self._told: dict[str, None] = {}  # keys of tokens that have appeared to watches
         self._questions: list[Replies] = []
         self._routes: dict[str, list[Subscriber]] = {}
+        self._link_listeners: list[Callable[[Any], object]] = []
         self.info = SimpleNamespace(
             routers_zid=lambda: [] if self.link is None else [self.link.far._zid],
             transports=lambda: [] if self.link is None else [SimpleNamespace(whatami=ROUTER)],
             peers_zid=list,
             links=list,
             zid=self.zid,
+            declare_transport_events_listener=self._follow_link,
         )
         network.sessions.append(self)
         if not self._connected():
@@ -362,16 +364,27 @@ class Session(Node):
 
     def _begin(self, router: Router) -> None:
         self.link = Link(self, router)
+        self._tell_of_link(self.link, PUT)
         router.welcome(self.link)
         things: list[Subscriber | Token] = [*self.subscribers, *self.queryables, *self.tokens]
         for each in things:
             self._declare(each, each.key)
         self._send(router.change)
 
+    def _follow_link(self, listener: Callable[[Any], object], *, history: bool = False) -> None:
+        self._link_listeners.append(listener)
+        if self.link is not None and history:
+            self._tell_of_link(self.link, PUT)
+
+    def _tell_of_link(self, link: Link, kind: zenoh.SampleKind) -> None:
+        for listener in self._link_listeners:
+            listener(SimpleNamespace(kind=kind, transport=SimpleNamespace(zid=link.far.zid())))
+
     def lost(self, link: Link) -> None:
         self.link = None
         if self.closed:
             return
+        self._tell_of_link(link, DELETE)
         questions, self._questions = self._questions, []
         for replies in questions:
             replies.finish()

@@ -121,7 +121,7 @@ SAFETY: Final = {
     "`safety.neighbour_timeout_s` (1 s)": f"{SCRIPT}lost_neighbour_is_left_out_after_a_second",
     "does not run for 1.2 s": f"{SCRIPT}lost_neighbour_is_left_out_after_a_second",
     "ends with exit code 2 without any command": f"{SCRIPT}second_process_ends_without_a_command",
-    "no other owner for 0.2 s": f"{SCRIPT}former_owner_commands_nothing",
+    "no other owner for 0.2 s": f"{SCRIPT}robot_asks_for_its_owner_before_anything_else",
     "ends with 2 about 2.5 s later": f"{SCRIPT}former_owner_commands_nothing",
     "more than 1 s of CPU": "fuzz/test_fuzz.py::test_nothing_escapes",
 }

@@ -24,7 +24,7 @@ import zenoh
 
 import agents.clock
 import agents.runtime.router as router_process
-from agents.network import messages, pubsub
+from agents.network import messages, name_ownership, pubsub
 from agents.network import session as network_session
 from agents.plugins import calls, registry
 from agents.runtime import command_line, lifeline, loop, telemetry
@@ -130,7 +130,7 @@ def _patch_network() -> None:
     pubsub.RingChannel = network_session.RingChannel = pubsub.FifoChannel = links.Ring
     pubsub.pose_publisher = lambda session, key, mime, kept=1: advanced.AdvancedPublisher(session, key, mime, kept)
     pubsub.advanced_subscriber = advanced.AdvancedSubscriber
-    pubsub.Callback = lambda function, indirect: function
+    pubsub.Callback = name_ownership.Callback = lambda function, indirect: function
     zenoh.SourceInfo = links.SourceInfo
     network_session.open_with = lambda chosen: current().network.open(chosen)  # noqa: PLW0108 - of the world that comes
     network_session.forbid_lingering = router_process.forbid_lingering = lambda: 0

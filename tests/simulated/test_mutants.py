@@ -11,6 +11,7 @@ from tests.simulated.laboratory import Mutant
 LIMIT_S = 45.0  # longest flight of a script, and twice the time to land
 RUNTIME, CONDUCTOR = "agents/runtime/", "experiments/real_time/conductor/"
 LOOP, WATCHDOG, HOT = f"{RUNTIME}loop.py", f"{RUNTIME}watchdog.py", f"{CONDUCTOR}hot_changes.py"
+DESCENT = f"{RUNTIME}descent.py"
 OWNERSHIP, MEASURE = "agents/network/name_ownership.py", "experiments/metrics/measure.py"
 HAZARDS, DETECTION = "agents/safety/hazards.py", "agents/safety/detection.py"
 
@@ -23,6 +24,10 @@ def row(name):
     test_safety.check_row(name, found[name])
 
 
+def former_owner(name):
+    return partial(test_safety.test_former_owner_commands_nothing, *test_safety.DISPLACED[name])
+
+
 def run(name):
     return partial(test_runs.test_exit_code, name)
 
@@ -30,8 +35,17 @@ def run(name):
 # file, what stands there, what the mutant has instead, script
 MUTANTS = {
     "owner not asked after a cut": (
-        f"{RUNTIME}descent.py", "if ownership.check_return(session) or stood:", "if False:",
-        test_safety.test_former_owner_commands_nothing,
+        DESCENT, "if ownership.check_return(session) or stood:", "if False:", former_owner("long cut"),
+    ),
+    "other owner forgotten when cut off again": (
+        DESCENT, "stood or ownership.contested or", "stood or", former_owner("cut off again"),
+    ),
+    "displaced body landed by the watchdog": (
+        WATCHDOG, "displaced = self._displaced()", "displaced = False", former_owner("in a loop that hangs"),
+    ),
+    "owner asked for after the second answer": (
+        "agents/network/session.py", "return self._answers > 0", "return self._answers > 1",
+        partial(test_safety.test_robot_asks_for_its_owner_before_anything_else, test_safety.SHORTLY_SILENT[0]),
     ),
     "empty answer not asked for again": (
         OWNERSHIP, "if tokens or tokens is None:", "if True:",

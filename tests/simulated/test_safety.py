@@ -141,15 +141,39 @@ def test_second_process_takes_a_free_name():
     assert (flight.code, second.code, flight.violations) == (1, 0, [])
 
 
-def test_former_owner_commands_nothing():
-    back = 3.5
-    flight = fly(TRIO, Fault(0.5, "cut", "A", lasts=back - 0.5), Fault(1.9, "twice", "A"), settings=["duration_s=7"])
+# end of a cut in which another process takes the name, end of the former owner's process, and more faults
+DISPLACED = {
+    "long cut": (3.5, 6.0, ()),
+    "cut as long as the lease": (1.944, 4.444, ()),  # seed 70470: its link is opened anew between two ticks
+    "cut off again": (3.5, 6.0, [Fault(3.6, "cut", "A", lasts=3.5)]),
+    "in a loop that hangs": (3.5, 12.45, [Fault(3.45, "hang", "A", 9.0)]),
+}
+
+
+@pytest.mark.parametrize(("back", "end", "more"), DISPLACED.values(), ids=DISPLACED)
+def test_former_owner_commands_nothing(back, end, more):
+    cut, twice = Fault(0.5, "cut", "A", lasts=back - 0.5), Fault(0.54 * back, "twice", "A")
+    flight = fly(TRIO, cut, twice, *more, settings=["duration_s=7"])
     robot, former, (second,) = flight.robots["A"], flight.of("default-A")[0], flight.of("second A")
-    assert [t for t, pid in robot.poses if pid == second.pid]
+    assert [t for t, pid in robot.poses if pid == second.pid and t < back]
     late = [t for t, pid in (*robot.poses, *robot.commands) if pid == former.pid and t > back + TICK_S]
     assert late == []
-    assert former.code == 2
-    assert back + 2.5 <= former.ended < back + 2.5 + 0.5
+    assert not flight.happened("hazard", "A", "its control loop hangs")
+    assert (former.code, flight.violations) == (2, [])
+    assert end - 1e-6 <= former.ended < end + 0.5
+
+
+SHORTLY_SILENT = Fault(0.5, "pause", "router", lasts=1.5), Fault(0.5, "cut", "A", lasts=1.0)
+
+
+@pytest.mark.parametrize("fault", SHORTLY_SILENT, ids=str)
+def test_robot_asks_for_its_owner_before_anything_else(fault):
+    """The link outlives both."""
+    flight = fly(TRIO, fault)
+    back = fault.at + fault.lasts
+    sent = [t for t, _ in (*flight.robots["A"].poses, *flight.robots["A"].commands) if t > back + TICK_S]
+    assert back + 0.2 < min(sent) < back + 0.2 + 0.15
+    assert (flight.code, flight.violations) == (0, [])
 
 
 @pytest.mark.parametrize("seed", mostly_slow([1, 2], 2))

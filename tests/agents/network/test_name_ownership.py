@@ -13,6 +13,7 @@ from math import inf
 from types import SimpleNamespace
 
 import pytest
+import zenoh
 
 from agents.body.limits import Safety
 from agents.network import messages, name_ownership
@@ -334,6 +335,20 @@ def test_link_that_is_back_waits_for_owner(taken, monkeypatch):
     assert lost[0] < back[0], "it holds by its decisions while it is cut off"
     if taken:
         assert (body.calls, body.commands, len(puts)) == (["open"], *back)
+
+
+@pytest.mark.parametrize(("events", "back"), [("r", False), ("Rr", True), ("Ss", False), ("RSs", True), ("rR", True)])
+def test_link_opened_anew_between_two_looks_is_noticed(events, back):
+    """By neighbours: capital letters are gone, small ones are there. At first r is, and of a mesh s."""
+    told: list[Callable[[object], object]] = []
+    info = SimpleNamespace(routers_zid=lambda: ["r"], peers_zid=lambda: [])
+    info.declare_transport_events_listener = lambda callback, **_: told.append(callback)
+    session, ownership = SimpleNamespace(info=info), name_ownership.OwnershipCheck([])
+    assert not ownership.check_return(session)
+    for zid in "r" + "s" * ("S" in events) + events:
+        kind = zenoh.SampleKind.PUT if zid.islower() else zenoh.SampleKind.DELETE
+        told[0](SimpleNamespace(kind=kind, transport=SimpleNamespace(zid=zid.lower())))
+    assert [ownership.check_return(session) for _ in range(2)] == [back, False]
 
 
 def test_late_alarm_leaves_the_tokens():
