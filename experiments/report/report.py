@@ -116,6 +116,7 @@ def write(
     drawings = figures.draw(folder / "figures", cases, traces, bands, width, pdf=pdf) if drawn else {}
     pictures = _pictures(cases, traces, bands, drawings)
     short, every_event = tables.events_tables(first)
+    clocks = tables.clocks_table(first)
     listing = text or msgspec.json.format(msgspec.json.encode(experiment), indent=2).decode()
     sections = [
         *_tables("Criteria", CRITERIA, [tables.criteria_table(cases)], folded=False),
@@ -124,7 +125,7 @@ def write(
         page.Section("Events", tables=(short,), more=every_event),
         *_details(cases),
         *_of_worlds(cases, drawings, len(pictures)),
-        *_tables("Clocks of other machines", CLOCKS, [tables.clocks_table(first)]),
+        *_tables("Clocks of other machines", CLOCKS, [clocks]),
         page.Section("Experiment file", listing=listing, folded=f"{len(listing.splitlines())} lines"),
         _defined(cases),
     ]
