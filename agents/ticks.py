@@ -8,6 +8,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from math import floor
+from typing import Final
+
+ROUNDING_S: Final = 1e-6  # times are sums of binary fractions: instants that differ by less are the same
+POLL_S: Final = 0.02  # pause of loops that look for news
 
 
 class Ticks:

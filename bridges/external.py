@@ -26,13 +26,13 @@ from agents.network import session as network
 from agents.network.shutdown import leave
 from agents.runtime.range_inbox import RangeInbox
 from agents.safety.preflight import FLOOR_M
+from agents.ticks import POLL_S
 from agents.vectors import NO_SETPOINT, ZERO, Setpoint, Vector, norm
 from bridges.measured_flight import FRESH_S, SETTLED, MeasuredFlight
 
 Action = Literal["drive", "takeoff", "land", "stop"]
 
 OPEN_S: Final = 5.0  # deadline of the router's answer and of the first position of every row
-POLL_S: Final = 0.02  # pause between looks for them
 WORLD: Final = "world"  # the address of robots in the shared world process
 REPEAT_S: Final = 0.1  # period of repeated orders: the publisher drops samples when its queue is full
 HALT_S: Final = 3.0  # time for which `land` is repeated to a robot on wheels

@@ -9,16 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from math import inf, isfinite, nan
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from agents.decision.assignment import Assignment
 from agents.decision.goals import GoalComputer, StationKeeping
 from agents.decision.lifecycle import AIRBORNE, RUNNING
 from agents.decision.neighbours import NO_WORDS
 from agents.plugins.law import Values
+from agents.ticks import ROUNDING_S
 from agents.vectors import UNKNOWN, ZERO, Pose, Vector, is_finite
-
-ROUNDING_S: Final = 1e-6  # instants of decisions are multiples of a period that binary fractions miss by less than this
 
 
 class CentreGoal(NamedTuple):

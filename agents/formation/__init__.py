@@ -1,4 +1,4 @@
 """Knowledge of a robot about its formation: targets of links, anchors, changes of shape.
 
-May import: agents.vectors.
+May import: agents.ticks, agents.vectors.
 """

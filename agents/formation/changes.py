@@ -12,9 +12,8 @@ from math import asin, atan2, cos, inf, isnan, nan, pi, sin, sqrt, tau
 import msgspec
 
 from agents.formation.link import Link
+from agents.ticks import ROUNDING_S
 from agents.vectors import UNKNOWN, Vector, clamp, norm
-
-ROUNDING_S = 1e-6  # decisions are multiples of a period that binary fractions miss by less than this
 
 
 class Change(msgspec.Struct, frozen=True):

@@ -1,4 +1,4 @@
 """Everything that an experiment file chooses by name: laws, triggers, predictors, planners, avoidances; their registry.
 
-May import: agents.errors, agents.formation, agents.user_folder, agents.vectors.
+May import: agents.errors, agents.formation, agents.ticks, agents.user_folder, agents.vectors.
 """

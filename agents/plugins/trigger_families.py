@@ -12,7 +12,8 @@ from typing import Annotated, ClassVar
 
 from msgspec import Meta
 
-from agents.plugins.triggers import ROUNDING_S, Place, SendOnDelta, Trigger, TriggerView
+from agents.plugins.triggers import Place, SendOnDelta, Trigger, TriggerView
+from agents.ticks import ROUNDING_S
 from agents.vectors import NotNegative, Positive, distance, norm
 
 

@@ -17,11 +17,11 @@ from typing import Annotated, Any, ClassVar, Final, Literal
 import msgspec
 from msgspec import Meta
 
+from agents.ticks import ROUNDING_S
 from agents.vectors import ZERO, NotNegative, Positive, Vector
 
 Place = Literal["communication", "control"]
 
-ROUNDING_S: Final = 1e-6  # ticks are multiples of a period that binary fractions miss by less than this
 NOWHERE: Final[Vector] = (inf, inf, inf)
 
 

@@ -25,9 +25,9 @@ from agents.network.keys import Keys
 from agents.robot import Robot
 from agents.runtime import range_inbox
 from agents.runtime.pose_inbox import PoseInbox
+from agents.ticks import ROUNDING_S
 
 STATUS_S: Final = 1.0
-ROUNDING_S: Final = 1e-6
 INCIDENTS: Final = 16  # repeated in each status
 WORDS: Final = tuple(phase.word for phase in Phase)
 

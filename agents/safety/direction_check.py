@@ -16,6 +16,7 @@ from math import atan2, exp, inf, sqrt
 from typing import Final
 
 from agents.body.kinds import Kind
+from agents.ticks import ROUNDING_S
 from agents.vectors import ZERO, Vector
 
 SAMPLE_S: Final = 0.05  # time from one comparison to the next
@@ -28,7 +29,6 @@ ASIDE: Final = (
 )
 AGAINST: Final = 2.0  # [rad] smallest angle of swapped or mirrored axes; late ones on circles show up to 1.1
 AGAINST_S: Final = 0.3  # time for which that counts: a gust is shorter
-ROUNDING_S: Final = 1e-6
 
 
 class DirectionCheck:

@@ -20,6 +20,7 @@ from math import cos, inf, isfinite, nan, sin, sqrt
 from typing import Final
 
 from agents.body.kinds import Kind
+from agents.ticks import ROUNDING_S
 from agents.vectors import UNKNOWN, ZERO, Setpoint, Vector, clamp, difference, distance, dot, is_finite, norm, wrap
 
 SAMPLE_S: Final = 0.1  # period in which the setpoints of all ticks are added up
@@ -34,7 +35,6 @@ FORGET_S: Final = 5.0  # time after which uncommanded motion is forgotten
 KEPT: Final = 1.0 - PIECE_S / FORGET_S  # share of earlier uncommanded motion that a piece keeps
 RUSH_S: Final = 0.5  # tolerated uncommanded travel, in seconds at top speed, besides the size of the robot
 RESTS_S, MOVES_S = 1.0, 8.0  # time to learn a steady wind, of a drone that rests, and of one that moves
-ROUNDING_S: Final = 1e-6
 OUTSIDE_M: Final = 0.4  # [m] the same of robots that fly on board by positions from outside, which may ring
 TURN: Final = 1.5  # tolerated uncommanded rotation of a wheeled robot [rad]
 REMEMBER_S: Final = 10.0  # time after which the correlation forgets a piece

@@ -16,6 +16,7 @@ from typing import Final
 
 from agents.body.interface import UNANSWERED, UNANSWERED_S
 from agents.clock import uptime
+from agents.ticks import POLL_S
 from bridges.crazyflie.kind import CRAZYFLIE
 from bridges.crazyflie.link import CrazyflieLink
 from bridges.crazyflie.protocol.addresses import SETPOINT_PACKETS, CrazyflieSettings, Outside
@@ -42,7 +43,6 @@ REPLY_S: Final = 0.15  # deadline of the reply to a high-level command; then the
 TRIES: Final = 12
 ARMING_S: Final = 4.0  # motors that are checked one by one take seconds
 STOPPING_S: Final = 2.0  # time after a stop for which a Crazyflie that does not report "locked" still reports "flying"
-POLL_S: Final = 0.02
 FRESH_S: Final = 1.0  # an older status is ignored
 LOOP_SILENCE_S: Final = 1.0  # [s] longest pause of the robot's loop between commands in flight
 FLYING_FLAG_S: Final = 3.0  # [s] time from a take-off to the flag "flying" in the status

@@ -14,9 +14,9 @@ import numpy as np
 from msgspec import Meta
 
 from agents.body.interface import BodyError
+from agents.plugins.files import MAX_FILE_BYTES
 from agents.vectors import Vector
 
-MAX_FILE_BYTES: Final = 1_000_000  # [bytes] largest configuration
 FARTHEST: Final = 50.0  # [m] largest distance of a station or an anchor from the origin, along each axis
 ORTHONORMAL: Final = 0.01  # largest error of R Rᵀ against the identity, and of the determinant against 1
 FLAT: Final = 0.1  # [m] standard deviation of anchors from a plane or line below which they lie in it

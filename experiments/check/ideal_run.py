@@ -18,9 +18,10 @@ import numpy as np
 
 from agents.body.kinds import Kind
 from agents.safety.hazards import HazardChange, Outcome
+from agents.ticks import ROUNDING_S
 from experiments.definition.experiment import WorldTable
 from experiments.definition.plan import Plan
-from experiments.recording.trace import ROUNDING_S, poses_in_run
+from experiments.recording.trace import poses_in_run
 from experiments.virtual_time import conductor, simulation, stretch
 from twins.arrays import Array, norm
 

@@ -26,6 +26,7 @@ from experiments.definition.plan import Plan
 from experiments.file.problems import Path
 from experiments.metrics.signals import WINDOW_S
 from twins.arrays import Array, Index, Mask, norm
+from twins.models.quadrotor import GRAVITY
 
 CLEARANCE: Final = 0.1  # [m] distance of one robot's top and another's bottom
 NEARLY: Final = 0.9  # share of its speed: the rest is needed to catch up
@@ -35,7 +36,6 @@ WIDE: Final = 0.01  # [m] smaller swings of a law that has no tolerance are its 
 PROBED_S: Final = 0.02  # [s] time between the looked-at moments of a plan from a file
 ACCELERATES_S: Final = 0.2  # [s] window of a mean acceleration
 BEGINS_M: Final = 0.15  # [m] distance of a robot from the begin of its recording: less than a goal may be away
-GRAVITY: Final = 9.81  # [m/s²]
 TILT: Final = math.radians(20.0)  # [rad] limit of tilt in the position controllers of small drones
 SETTLED: Final = 1e-3  # [m] travel per decision below which robots are at rest, and in `WINDOW_S` one on wheels stands
 

@@ -12,10 +12,11 @@ import numpy as np
 
 from agents.body.kinds import KINDS, Flight, Kind
 from agents.formation import anchors
-from agents.formation.changes import ROUNDING_S, Change, Target, change_target, exists, planned_at
+from agents.formation.changes import Change, Target, change_target, exists, planned_at
 from agents.formation.link import BY_DISTANCE, BY_NOTHING, BY_RELATIVE, Link
 from agents.plugins.law import WANTS, Law
 from agents.plugins.laws import Displacement, Distance, Gradient
+from agents.ticks import ROUNDING_S
 from experiments.definition.experiment import AnchorTable, ChangeTable, Experiment
 from experiments.definition.graph import Links
 from experiments.definition.links import OneWay, held_height, link_pairs, link_target

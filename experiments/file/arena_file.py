@@ -18,10 +18,10 @@ from experiments.catalogue import index
 from experiments.definition.experiment import Arena, FileTable
 from experiments.file import structure
 from experiments.file import text as syntax
+from experiments.file.completion import LOOKED_AT
 from experiments.file.consistency.arena import arena_faults
 from experiments.file.problems import Fault, Text, refusal
 
-LOOKED_AT: Final = 100  # files beside an experiment, for the one that was meant
 KEPT: Final = "experiment.toml"  # name of the experiment in the folder of a run, in which its arena files lie as well
 SUFFIX: Final = ".toml"  # unused by any other file there
 _HERE: Final = ("arena", "file")

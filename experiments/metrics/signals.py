@@ -19,6 +19,7 @@ from msgspec import structs
 
 from agents.plugins.laws import Distance, Gradient
 from agents.plugins.predictors import HOLD, Predictor
+from agents.ticks import ROUNDING_S
 from agents.vectors import Vector
 from experiments.arrays import ArrayTable
 from experiments.definition.formation import counted_links, robot_sums, targeted
@@ -28,7 +29,7 @@ from experiments.metrics import centralised
 from experiments.metrics.clearance import Clearance, collisions
 from experiments.metrics.results import Collision, LinkDelivery, PhaseMetrics
 from experiments.recording.losses import count_unrecorded
-from experiments.recording.trace import ROUNDING_S, Trace
+from experiments.recording.trace import Trace
 from twins.arrays import Array, Index, Mask, norm
 
 WINDOW_S: Final = 1.0  # [s] window of the moving mean that decides on acquisition, and of the residual

@@ -11,9 +11,9 @@ import numpy as np
 
 from agents.network.messages import CentreState, Status
 from agents.network.validation import missed, most_poses
+from agents.ticks import ROUNDING_S
 from experiments.definition.plan import Plan
 from experiments.recording.topics import SentPose
-from experiments.recording.trace import ROUNDING_S
 from twins.arrays import Index
 
 STATUS_S: Final = 1.0  # a status at most this much after the end of a run still counts for it

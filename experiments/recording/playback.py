@@ -33,6 +33,7 @@ from agents.network.messages import (
 )
 from agents.network.validation import ABSURD, FUTURE_S, is_count
 from agents.plugins.registry import PluginError
+from agents.ticks import ROUNDING_S
 from experiments.arrays import PoseTable, known_rows
 from experiments.definition.plan import Plan
 from experiments.definition.standby import without_standby
@@ -52,7 +53,6 @@ from experiments.recording.ros2 import payload
 from experiments.recording.topics import JSON, KINDS_JSON, METADATA, TOPICS, SentGoal, SentPose, Topic
 from experiments.recording.trace import (
     OPTIONAL,
-    ROUNDING_S,
     Goals,
     Trace,
     poses_in_run,

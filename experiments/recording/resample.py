@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from experiments.recording.trace import ROUNDING_S
+from agents.ticks import ROUNDING_S
 from twins.arrays import Array, Mask, norm
 
 HOLE_S: Final = 1.0  # telemetry that is silent for longer is not interpolated over

@@ -13,6 +13,7 @@ import numpy as np
 from agents.network import messages
 from agents.network.messages import Contact, Event, WorldState
 from agents.safety.hazards import OVER, QUIET_S, UNRESOLVED, is_blind
+from agents.ticks import ROUNDING_S
 from experiments.arrays import PoseTable, data_frame
 from experiments.definition.formation import counted_links, errors_over_time, robot_sums
 from experiments.definition.plan import Plan, finds_contacts
@@ -21,7 +22,6 @@ from twins.arrays import Array, Index, Mask
 
 EPOCH: Final = 1_700_000_000.0  # UTC [s] of the common start in virtual time: any, but the same in every run
 OPTIONAL: Final = ("attitude", "shadow_position", "shadow_yaw")  # columns that are left out where nothing is known
-ROUNDING_S: Final = 1e-6  # UTC seconds in a float are exact to a quarter of a microsecond
 
 M = TypeVar("M", Contact, WorldState)
 

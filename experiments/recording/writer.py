@@ -39,6 +39,7 @@ from mcap.writer import MCAP0_MAGIC
 from agents.body.kinds import KINDS, RecordedKind
 from agents.network import messages
 from agents.network.messages import Event, Goal, Pose, State, Vector
+from agents.ticks import ROUNDING_S
 from experiments.definition.plan import Plan
 from experiments.recording import version
 from experiments.recording.reader import RecordingError
@@ -183,7 +184,6 @@ SCENE: Final = "/scene"
 FRAMES_S: Final = 0.04  # pause of two transforms of a robot [s]
 SCENE_S: Final = 0.2  # pause of two drawings of the scene [s]
 LATE_S: Final = 2.0  # age of a message on arrival above which its clock is wrong [s]
-ROUNDING_S: Final = 1e-6
 LATEST_S: Final = 2.0**32  # a stamp beyond (the year 2106) is a broken clock; nanoseconds of it may not fit the file
 
 

@@ -13,10 +13,10 @@ import numpy as np
 
 from agents.decision.lifecycle import Phase
 from agents.network.messages import Contact, Status, WorldState
+from agents.ticks import ROUNDING_S
 from experiments.definition.formation import errors_over_time
 from experiments.metrics.clearance import Overlap
 from experiments.recording.playback import WholeRecording
-from experiments.recording.trace import ROUNDING_S
 from experiments.scene.condition import AT_REST, Condition, RobotRow, condition
 from experiments.scene.drawing import SceneDrawing
 from experiments.scene.stage import TOUCH_S, TRAIL, TRAIL_S, LinkTracker, Moment, SceneModel, with_bare_links

@@ -13,12 +13,12 @@ from typing import Any, Final
 import viser
 from websockets.asyncio import server as websockets
 
+from agents.body.device_address import LOOPBACK
 from agents.errors import ExplainedError
 from experiments.scene.drawing import light
 from experiments.view.gate import Gate
 from experiments.view.heartbeat import page_mark
 
-LOOPBACK: Final = "127.0.0.1"
 _PATCHING: Final = threading.Lock()
 
 

@@ -18,6 +18,7 @@ from agents.decision.lifecycle import FINISHED, SCRIPTED, Phase
 from agents.decision.stepping import Words
 from agents.network import messages
 from agents.safety.hazards import Outcome
+from agents.ticks import ROUNDING_S
 from experiments.arrays import PoseTable
 from experiments.definition.experiment import WALL
 from experiments.definition.graph import Links
@@ -26,7 +27,6 @@ from experiments.recording.topics import Message
 from experiments.recording.trace import (
     EPOCH,
     OPTIONAL,
-    ROUNDING_S,
     Goals,
     Trace,
     poses_in_run,

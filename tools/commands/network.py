@@ -15,6 +15,7 @@ import typer
 from typer import Option
 
 from agents.errors import ExplainedError
+from agents.ticks import POLL_S
 from tools.options import As, AsJson, Connect, KeyExpression, Lab, Seconds, example, place, print_json, session
 from tools.terminal import printable
 
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
 
 app: Final = typer.Typer()
 
-POLL_S: Final = 0.02
 LAST_S: Final = 0.5  # limit for the answers with last poses: a frozen robot gives none
 WINDOW_S: Final = 1.0
 DEPTH: Final = 8192  # samples between two polls

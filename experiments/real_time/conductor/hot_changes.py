@@ -16,6 +16,7 @@ import msgspec
 import zenoh
 
 from agents.body.kinds import KINDS
+from agents.body.shadow_twin import TWIN
 from agents.decision.lifecycle import PAUSED
 from agents.errors import Refusal, did_you_mean
 from agents.network import messages
@@ -38,7 +39,6 @@ INSIST_S: Final = 5.0  # an order that a robot refuses is repeated for this long
 AGAIN_S: Final = 0.5  # period
 
 MARGIN_M: Final = 0.1  # free space around a robot that begins to move
-TWIN: Final = "twin"  # a body that is there as long as its process
 OF_BODY: Final = ("body", "start", "hover", "position", "device", "sensors", "ranges")  # fields of a spare
 
 Steps = Generator[None, None, str]  # returns the result, in words

@@ -21,6 +21,7 @@ import msgspec
 from agents.body.interface import UNANSWERED
 from agents.body.kinds import KINDS, Trial
 from agents.network import messages
+from agents.ticks import POLL_S
 from experiments.definition.experiment import ChannelTable, Formation, LegTable, RobotTable
 from experiments.definition.plan import Plan, latest_s
 from experiments.file.document import Document
@@ -35,7 +36,6 @@ from experiments.real_time.conductor.run_view import ShowProgress
 from experiments.real_time.hosts.launcher import LAND_S
 
 PREFLIGHT: Final = "preflight"  # name of the case, in files and on the console
-POLL_S: Final = 0.02
 SAMPLE_S: Final = 2.0  # time for which robots are observed at rest
 INSPECT_S: Final = 0.2  # pause of two inspections
 HOLD_S: Final = 2.0  # time for which a hopping drone stays at its height

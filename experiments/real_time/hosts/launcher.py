@@ -30,6 +30,7 @@ from agents.errors import ExplainedError
 from agents.network import messages
 from agents.network.endpoints import from_here
 from agents.runtime.lifeline import BEAT_S, SILENCE_S, stop_line
+from agents.ticks import POLL_S
 from experiments.real_time.processes import zygote
 from experiments.real_time.processes.zygote import Forked, NoZygote
 
@@ -38,7 +39,6 @@ ZYGOTE: Final = "zygote"
 LAND_S: Final = 15.0  # time for robots to come down after their lifeline was cut
 LINGER_S: Final = 15.0  # the router outlives a killed conductor, so that the landing is recorded
 READY_S: Final = 15.0  # limit for a process to say that it is ready
-POLL_S: Final = 0.02
 STOP_PATIENCE_S: Final = 0.1  # patience for the lock of the list of processes
 TAIL: Final = 12  # lines of a dead process's output that are worth showing
 

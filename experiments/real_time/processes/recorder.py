@@ -23,12 +23,12 @@ from agents.network.keys import Keys
 from agents.network.messages import M
 from agents.network.shutdown import AFTER_S, end
 from agents.runtime import command_line
+from agents.ticks import POLL_S
 from experiments.real_time.processes.joining import Launch, joined
 from experiments.recording.topics import DEPTH, RARE, TOPICS, Message, Topic
 from experiments.recording.writer import Recording
 from experiments.scene import markers
 
-POLL_S: Final = 0.02
 FLUSH_S: Final = 1.0
 FRESH_S: Final = 0.05  # largest time between a state and a true pose that belongs to it
 PATIENCE_S: Final = 0.2  # longest wait of a state for the true pose after it
