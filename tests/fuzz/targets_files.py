@@ -189,6 +189,7 @@ def trajectories():
 
     def take(data):
         curve = formats.read(data.decode("utf-8", "replace"), "drone")
+        assert curve.duration > 0.0
         for share in (-1.0, 0.0, 0.3, 1.0, 2.0):
             assert isfinite(sum(curve.pose(share * curve.duration)[:2]) + curve.speed)
 
