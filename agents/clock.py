@@ -16,7 +16,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from math import isfinite
+from math import inf, isfinite
 from typing import Final
 
 SLEW: Final = 0.005  # [s/s] a hundred times the drift of quartz, harmless for any body
@@ -90,3 +90,29 @@ class Clock:
         change = min(max(lacks, -SLEW * dt), SLEW * dt)
         self.correction_s = self._wanted if change == lacks else self.correction_s + change
         return change
+
+
+class StampAge:
+    """Age of messages: arrival less stamp, less the smallest such difference so far, for the clocks are not the same.
+
+    A stamp that does not grow comes from a clock that was set back, or from a sender without stamps: the record
+    restarts. Delays that are constant do not show.
+    """
+
+    def __init__(self, drift: float) -> None:
+        """`drift`: largest difference between the rates of the two clocks [s/s]."""
+        self.least = inf  # smallest difference [s]
+        self._drift, self._arrival, self._stamp = drift, -inf, -inf
+
+    def age(self, arrival: float, stamp: float) -> float:
+        """Age [s] of a message with this stamp [s] that arrived at `arrival` [s, monotonic]."""
+        if stamp <= self._stamp:
+            self.least = inf
+        self._stamp = stamp
+        return self.lateness(arrival, stamp)
+
+    def lateness(self, arrival: float, stamp: float) -> float:
+        """Age [s] of a message that others may have overtaken."""
+        self.least = min(self.least + self._drift * max(arrival - self._arrival, 0.0), arrival - stamp)
+        self._arrival = arrival
+        return arrival - stamp - self.least

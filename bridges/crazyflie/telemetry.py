@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from math import exp, inf, isfinite, nan, radians
 from typing import Final
 
-from agents.clock import uptime
+from agents.clock import StampAge, uptime
 from bridges.crazyflie.delay import ClimbLog
 from bridges.crazyflie.link import CrazyflieLink
 from bridges.crazyflie.positioning import SETTLED_BELOW
@@ -55,33 +55,28 @@ MEASURING: Final = len(STATION_TEXT) - 1  # lighthouse.status of a deck that mea
 
 
 class PacketAge:
-    """Age of packets of one drone: arrival less its stamp, less the smallest such difference so far."""
+    """Age of packets of one drone, by stamps that overflow, on a clock that restarts with the drone."""
 
     def __init__(self) -> None:
         self.restarted = False  # the clock of the drone restarted
         self.connected_anew = False  # the next packet is the first over a new connection
         self._last: int | None = None  # stamp without its overflows [ms]
-        self._arrived = -inf
-        self._least = inf
+        self._ages = StampAge(DRIFT)
 
     def age(self, arrival: float, stamp: int) -> float:
         """Age [s] of a packet with this stamp [ms, 24 bits] that arrived at `arrival` [s]."""
         if self._last is None:
             self._last = stamp
         since = (stamp - self._last + WRAP_MS // 2) % WRAP_MS - WRAP_MS // 2
-        change = arrival - 1e-3 * (self._last + since) - self._least  # change of the smallest difference
-        late = self.connected_anew and isfinite(self._least) and change > LATE_S
+        change = arrival - 1e-3 * (self._last + since) - self._ages.least  # change of the smallest difference
+        jumped = isfinite(change) and (change < -AHEAD_S or (self.connected_anew and change > LATE_S))
         self.connected_anew = False
-        if since < -BACK_MS or (change < -AHEAD_S and isfinite(self._least)) or late:
+        if since < -BACK_MS or jumped:
             self.restarted = True
-            self._last, self._least = stamp, inf
+            self._last, self._ages.least = stamp, inf
         elif since > 0:
             self._last += since
-        delay = arrival - 1e-3 * (self._last + min(since, 0))
-        crept = DRIFT * max(arrival - self._arrived, 0.0) if isfinite(self._arrived) else 0.0
-        self._least = min(self._least + crept, delay)
-        self._arrived = arrival
-        return delay - self._least
+        return self._ages.lateness(arrival, 1e-3 * (self._last + min(since, 0)))
 
 
 class Telemetry:

@@ -19,7 +19,7 @@ from agents.body.byte_stream import MalformedStream
 from agents.body.capture_reader import CaptureFrame, CaptureReader, MeasuredPose
 from agents.body.coordinates import Coordinates
 from agents.body.external_pose import External
-from agents.clock import Clock, uptime
+from agents.clock import Clock, StampAge, uptime
 from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
@@ -42,28 +42,6 @@ QUEUE_S: Final = 0.1  # frames that wait for longer are reported
 AGAIN_S: Final = 0.1  # time of lower frame numbers after which the system has begun to count again
 SHOWN_S: Final = 1.0  # time over which rate and latency are measured before they are shown
 LATE_S: Final = 0.1  # latency from which on drones sway [s]
-
-
-class FrameQueue:
-    """Time for which frames wait in queues: arrival less the server's clock, less the least of that so far.
-
-    A queue that empties shows at once; what is constant does not show.
-    """
-
-    def __init__(self) -> None:
-        self._clock, self._arrived = -math.inf, 0.0
-        self._least = math.inf
-
-    def wait_s(self, frame: CaptureFrame, arrived: float) -> float:
-        """Time for which a frame waited that arrived at `arrived` on any steady clock [s]; 0 where it is unknown."""
-        if math.isnan(frame.clock_s):
-            return 0.0
-        if frame.clock_s < self._clock:  # another stream
-            self._least = math.inf
-        crept, delay = RATE_OFF * (arrived - self._arrived), arrived - frame.clock_s
-        self._clock, self._arrived = frame.clock_s, arrived
-        self._least = min(self._least + crept, delay)
-        return delay - self._least
 
 
 class PoseFilter:
@@ -214,18 +192,18 @@ class Bridge:
 
     def _pump(self, reader: CaptureReader, over: Callable[[], bool]) -> None:
         heard, number = uptime(), -1
-        queue, figures = FrameQueue(), StreamFigures(self._print_line, self._latency)
+        ages, figures = StampAge(RATE_OFF), StreamFigures(self._print_line, self._latency)
         while not over():
             frame = reader.newest(POLL_S)
             now = uptime()
             if frame is not None and frame.number < number and now - heard > AGAIN_S:
-                number, queue = -1, FrameQueue()  # the system was started again: its numbers, and its clock
+                number, ages = -1, StampAge(RATE_OFF)  # the system was started again: its numbers, and its clock
             if frame is None or frame.number <= number:
                 if now - heard > SILENCE_S:
                     raise TimeoutError(f"no new frame for {SILENCE_S:g} s (is the system live, and not paused?)")
                 continue
             heard, number = now, frame.number
-            waited = queue.wait_s(frame, now)
+            waited = 0.0 if math.isnan(frame.clock_s) else ages.age(now, frame.clock_s)
             if waited > QUEUE_S:
                 self._report_once("frames wait in a queue before they arrive: is the network or a computer too slow?")
             figures.count(frame, now)

@@ -10,6 +10,7 @@ from math import cos, hypot, inf, isfinite, nan, pi, sin
 from typing import Final
 
 from agents.body.external_pose import velocity_after
+from agents.clock import StampAge
 from agents.vectors import wrap
 from bridges.ros2 import messages as ros2
 from bridges.ros2.messages import Message
@@ -25,28 +26,6 @@ SETTLING_S: Final = 0.12  # time after the first message of a node, to the secon
 Planar = tuple[float, float, float]  # x, y [m], yaw [rad]
 
 
-class StampAge:
-    """Age of messages: arrival less stamp, less the smallest such difference so far, for the clocks are not the same.
-
-    A stamp that does not grow comes from a clock that was set back, or from a sender without stamps: the record
-    restarts.
-    """
-
-    def __init__(self) -> None:
-        self._stamp = self._arrival = -inf
-        self._least = inf
-
-    def age(self, arrival: float, stamp: float) -> float:
-        """Age [s] of a message with this stamp [s] that arrived at `arrival` [s, monotonic]."""
-        if stamp <= self._stamp:
-            self._least = inf
-        crept = DRIFT * max(arrival - self._arrival, 0.0) if isfinite(self._arrival) else 0.0
-        delay = arrival - stamp
-        self._least = min(self._least + crept, delay)
-        self._stamp, self._arrival = stamp, arrival
-        return delay - self._least
-
-
 class Odometry:
     """Pose and speed of a robot in the arena, by its odometry. Times `now` are monotonic [s]."""
 
@@ -57,7 +36,7 @@ class Odometry:
         self.received = -inf  # time of the last odometry
         self.age = 0.0  # age of the last odometry when it arrived, by its stamp [s]
         self.restarted = False
-        self._start, self._stamps = start, StampAge()
+        self._start, self._stamps = start, StampAge(DRIFT)
         self._raw_pose: Planar = (nan, nan, nan)  # pose in odometry's own frame
         self._stamp = inf  # time of that pose, on the clock of the robot [s]
         self._frame: Planar | None = start if boot else None  # origin of odometry in the arena,

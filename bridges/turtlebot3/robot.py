@@ -12,13 +12,14 @@ from typing import Final
 import zenoh
 
 from agents.body.interface import FRESH_S, UNANSWERED, UNANSWERED_S, BodyRequest, RangeScan, settings
+from agents.clock import StampAge
 from agents.network import pubsub
 from agents.network import session as network
 from bridges.ros2 import messages as ros2
 from bridges.ros2.messages import Message
 from bridges.ros2.node import Participant
 from bridges.turtlebot3 import protocol as turtlebot3
-from bridges.turtlebot3.odometry import STANDING, Odometry, StampAge
+from bridges.turtlebot3.odometry import DRIFT, STANDING, Odometry
 
 REPEAT_S: Final = 0.05  # longest time between commands while the robot shall move,
 BETWEEN_S: Final = 0.02  # shortest time between commands that change
@@ -114,7 +115,7 @@ class TurtleBotConnection:
         self.joined = False  # True once its topics are joined
         self.time = -inf  # time of measurement of the pose, on the clock of `Body.read` [s]
         self._clock = request.clock
-        self._scan_age = StampAge()
+        self._scan_age = StampAge(DRIFT)
         self._command_receivers: dict[str, tuple[str, str]] = {}
 
     def join(self, participant: Participant) -> None:

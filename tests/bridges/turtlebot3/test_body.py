@@ -12,10 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.body.interface import UNANSWERED, BodyError
+from agents.clock import StampAge
 from bridges.ros2 import messages as ros2
 from bridges.turtlebot3 import protocol as turtlebot3
 from bridges.turtlebot3.body import DIAGNOSIS_S, OPEN_S, TurtleBot3
-from bridges.turtlebot3.odometry import StampAge
+from bridges.turtlebot3.odometry import DRIFT
 from bridges.turtlebot3.robot import ZEROS, TurtleBotConnection, ranges
 from tests.bridges.turtlebot3.turtlebots import NOWHERE, STYLES, FakeRos, Stage, clock, odometry, request
 from tests.waiting import ManualClock, until
@@ -90,7 +91,7 @@ def test_rays_are_finite_or_nothing(first, increment, farthest, distance, seen):
     ],
 )
 def test_age_by_stamps_of_another_clock(arrivals, stamps, ages):
-    stamped = StampAge()
+    stamped = StampAge(DRIFT)
     assert [stamped.age(*pair) for pair in zip(arrivals, stamps, strict=True)] == pytest.approx(ages, abs=0.005)
 
 
