@@ -101,8 +101,8 @@ class StampAge:
 
     def __init__(self, drift: float) -> None:
         """`drift`: largest difference between the rates of the two clocks [s/s]."""
-        self.least = inf  # smallest difference [s]
-        self._drift, self._arrival, self._stamp = drift, -inf, -inf
+        self.least, self._drift = inf, drift  # smallest difference [s]
+        self._arrival = self._stamp = -inf
 
     def age(self, arrival: float, stamp: float) -> float:
         """Age [s] of a message with this stamp [s] that arrived at `arrival` [s, monotonic]."""
