@@ -10,6 +10,7 @@ import ast
 import os
 import pickle
 import re
+import signal
 import socket
 import subprocess
 import sys
@@ -36,7 +37,7 @@ from experiments.course.cells import Inmate
 LONGEST: Final = 1 << 20  # longest answer [bytes]
 PASSED: Final = ("PATH", "PYTHONPATH", "LD_LIBRARY_PATH", "ZENPARK_CACHE_DIR")  # variables of the environment
 FAILED: Final = 1  # exit code where none is known
-ENDED: Final = -24  # exit code of a process that had no computing time left: SIGXCPU
+ENDED: Final = -signal.SIGXCPU  # exit code of a process that had no computing time left
 # Class variables that are taken from a group's class, by its base, with their types
 DECLARES: Final[Mapping[type, Mapping[str, Any]]] = {
     Law: {"SAYS": dict[str, Said], "ALONE": bool, "PREDICTION": str},
@@ -139,7 +140,7 @@ def company(choices: Sequence[str], solved: Path, handed: Path, cpu_s: int, memo
         cpu_s: Computing time of a cell [s].
         memory: Memory of a cell [bytes].
     """
-    near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    near, far = socket.socketpair()
     command = [sys.executable, "-P", "-m", "experiments.course.cells", str(far.fileno()), "numpy"]
     command += sorted({name for each in choices for name in _imports(handed / each.partition(":")[0])})
     kept = {name: os.environ[name] for name in PASSED if name in os.environ}
@@ -193,23 +194,21 @@ def _step(self: Any, view: View, memory: Memory) -> Control:  # noqa: ANN401 - l
 
 
 def _pull(self: Any, apart: Vector, link: Link) -> Vector:  # noqa: ANN401 - likewise
-    pulled: Vector = _fitting(self, "pull", self.COMPANY.ask(self, "", "pull", apart, link), Vector, "three numbers")
+    answer = self.COMPANY.ask(self, "", "pull", apart, link)
+    try:
+        pulled: Vector = msgspec.convert(answer, Vector)
+    except msgspec.ValidationError:
+        raise wrong("law", self, "pull", answer, "three numbers") from None
     return pulled
 
 
 def _fires(self: Any, view: TriggerView) -> bool:  # noqa: ANN401 - likewise
-    answer = self.COMPANY.ask(self, view, "fires", view)
-    fired: bool
-    fired, memory = _fitting(self, "fires", answer, tuple[bool, dict[str, float]], "True or False")
-    vars(view.memory).update({name: memory.get(name, 0.0) for name in self.MEMORY})
+    fired, memory = self.COMPANY.ask(self, view, "fires", view)
+    if not isinstance(fired, bool):
+        raise wrong("trigger", self, "fires", fired, "True or False")
+    numbers = {name: memory[name] for name in self.MEMORY if isinstance(memory.get(name), float | int)}
+    vars(view.memory).update(numbers)
     return fired
-
-
-def _fitting(plugin: object, method: str, answer: object, kind: Any, wanted: str) -> Any:  # noqa: ANN401 - of that type
-    try:
-        return msgspec.convert(answer, kind)
-    except msgspec.ValidationError:
-        raise wrong("plug-in", plugin, method, answer, wanted) from None
 
 
 _LAW: Final = {"begin": _begin, "step": _step}

@@ -140,7 +140,7 @@ def mark(
     limit: Annotated[int, Option(min=1, help="Computing time for an exercise of a group [s].")] = 60,
     as_json: AsJson = False,
 ) -> int:
-    """Mark what groups handed in, each in a process with limits; exit code 1 unless all criteria are met."""
+    """Mark what groups handed in, by code of the course alone; exit code 1 unless all criteria are met."""
     import secrets
 
     from agents.errors import did_you_mean
@@ -165,6 +165,11 @@ def mark(
     names = [SOLUTION, *(folder.resolve().name for folder in folders)]
     found.sort(key=lambda each: (names.index(each.group), each.exercise))
     passed = all(each.passed for each in found)
+    if faulty := [each.exercise for each in found if each.group == SOLUTION and not each.passed]:
+        say(
+            f"the solution itself misses criteria of {', '.join(faulty)}: mend these first, their marks say nothing",
+            to=sys.stderr,
+        )
     again = f"seeds {first} to {first + seeds - 1}; the same again with --seed {first}"
     result = {"passed": passed, "seed": first, "seeds": seeds, "marks": found}
     print_result(result, *_table(found, [*asked]), again, as_json=as_json)

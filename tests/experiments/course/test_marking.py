@@ -1,9 +1,9 @@
 """Exercises are made from their solutions; whatever the code of a group does, it passes by its criteria alone."""
 
 import json
+import os
 import signal
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -201,6 +201,8 @@ def test_groups_hand_in_what_they_like(course, tmp_path):
     table = zenpark("mark", groups / "right", "--from", course, "--seed", 5).stdout.splitlines()
     assert [line.split() for line in table[1:3]] == [["(solution)", "1/1", "1/1"], ["right", "1/1", "1/1"]]
     assert table[3] == "seeds 5 to 7; the same again with --seed 5"
+    write({"meet.toml": FILE.replace("0.9", "0.1")}, course)
+    assert "the solution itself misses criteria of meet: mend these" in marked(course, groups / "nothing", code=1)[1]
 
 
 def test_wrong_calls_are_refused(course, tmp_path):
@@ -219,21 +221,21 @@ def test_wrong_calls_are_refused(course, tmp_path):
     assert "holds no exercise" in str(invoke("course", tmp_path / "new", "--from", tmp_path, code=1).exception)
 
 
-SLEEPS = "__import__('signal').pthread_sigmask(0, {14}); time.sleep(600)"  # a law that no alarm wakes
+# A law that no alarm wakes, with a name for its process
+SLEEPS = (
+    "__import__('ctypes').CDLL(None).prctl(15, b'%s'); __import__('signal').pthread_sigmask(0, {14}); time.sleep(600)"
+)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL, signal.SIGINT])
 def test_marking_that_ends_leaves_no_process(course, tmp_path, number):
-    write({"meet.toml": FILE, "meet.py": LAW.replace(LINE, SLEEPS)}, tmp_path / "sleeps")
+    name = f"nap-{os.getpid()}-{number}"  # at most 15 letters
+    write({"meet.toml": FILE, "meet.py": LAW.replace(LINE, SLEEPS % name)}, tmp_path / "sleeps")
     words = ("mark", tmp_path / "sleeps", "--from", course, "--seeds", 1)
     with started(*GUARD, *words, env=environment(TMPDIR=str(tmp_path))) as marking:
-        below = partial(psutil.Process(marking.pid).children, recursive=True)
-        until(
-            lambda: any(each.status() == "sleeping" and each.parents()[2].pid == marking.pid for each in below()),
-            "a law sleeps",
-        )
-        processes = below()
+        until(lambda: any(each.info["name"] == name for each in psutil.process_iter(["name"])), "the law sleeps")
+        processes = psutil.Process(marking.pid).children(recursive=True)
         assert len(processes) >= 4  # guard, judge, nursery, cell
         marking.send_signal(number)
         marking.wait()
@@ -310,7 +312,11 @@ def test_errors_are_computed_by_the_course(tmp_path):
     write({"square.toml": SQUARE, "square.py": PULL}, course)
     lies = posed(PULL).replace("return abs(", "return 0.0 * abs(")
     talks = PULL.replace("return view.deviation > self.least", "return True")
-    for name, text in (("lies", lies), ("talks", talks), ("right", PULL)):
+    forgets = PULL.replace("return view.deviation", "view.deviation")
+    groups = {"lies": lies, "talks": talks, "forgets": forgets, "right": PULL}
+    for name, text in groups.items():
         write({"square.toml": SQUARE, "square.py": text}, tmp_path / name)
-    found, _ = marked(course, *(tmp_path / name for name in ("lies", "talks", "right")), code=1)
-    assert {name: each["met"] for name, each in found.items()} == {"(solution)": 2, "right": 2, "lies": 1, "talks": 1}
+    found, said = marked(course, *(tmp_path / name for name in groups), code=1)
+    met = {"(solution)": 2, "lies": 1, "talks": 1, "forgets": 0, "right": 2}
+    assert {name: each["met"] for name, each in found.items()} == met
+    assert "`fires` of the trigger Late must give True or False, not nothing: is a `return` missing?" in said
