@@ -134,8 +134,14 @@ def turned(analysis: Analysis) -> Iterator[Finding]:
 
 
 def positioning(analysis: Analysis) -> Iterator[Finding]:
-    """Warn of a source of positions that no robot uses; say which robots need a program of the lab's own."""
+    """Warn of sources and robots that have nothing to do with each other; say which robots need a lab's own program."""
     experiment, measured = analysis.plan.experiment, analysis.plan.externally_measured
+    unseen = [name for name in measured if experiment.robots[name].body == "twin"]
+    if unseen and experiment.capture is not None:
+        twin = KINDS[experiment.robots[unseen[0]].kind].twin
+        message = f"{join_names(unseen)}: no motion capture sees a twin in its own process: `run` waits for positions"
+        remedy = f'write body = "{twin.body}"' if twin else "leave `position` out"
+        yield Finding("warning", "position-unseen", message, remedy, ("robots", unseen[0], "position"))
     if experiment.capture is not None and not measured:
         message = f'no robot has position = "external", so nothing is asked of {experiment.capture.source}'
         yield Finding("warning", "position-unused", message, "add it to each robot that is measured", ("positioning",))

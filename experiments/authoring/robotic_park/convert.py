@@ -96,7 +96,7 @@ def convert_text(
             "duration_s": duration_s,
             **({"architecture": "centralised"} if park.central else {}),
             "trigger": trigger,
-            **({"positioning": "vicon-twin"} if any(robot.positioning != "Intern" for robot in park.robots) else {}),
+            **({"positioning": "vicon-twin"} if any(map(_captured, park.robots)) else {}),
         },
         "arena": {"size": _arena(found)},
         "rates": {"body_hz": RATE_HZ, "pose_hz": pose_hz, "coordination_hz": coordination_hz},
@@ -184,7 +184,7 @@ def _robot(robot: ParkRobot, found: Heights, row: int) -> dict[str, Any]:
         "start": start,
         **({"hover": float(found.hover[row])} if flies else {}),
         **_body(robot),
-        **({"position": "external"} if robot.positioning != "Intern" else {}),
+        **({"position": "external"} if _captured(robot) else {}),
         **({"shadow": {}} if robot.type == "digital_twin" else {}),
     }
 
@@ -200,12 +200,18 @@ def _body(robot: ParkRobot) -> dict[str, str]:
     return {}
 
 
+def _captured(robot: ParkRobot) -> bool:
+    """Whether motion capture measures a robot, which does not see twins in their own processes."""
+    return robot.positioning != "Intern" and bool(_body(robot))
+
+
 def _notes_on_robots(park: ParkExperiment) -> Iterator[str]:
     """Notes on settings of the authors' robots that zenpark does not have."""
     robots = park.robots
     idle = [robot for robot in robots if robot.task.written and not robot.task.enable]
     homeless = [robot for robot in robots if robot.type != "virtual" and not _body(robot)]
-    captured = [robot for robot in robots if robot.positioning != "Intern"]
+    outside = [robot for robot in robots if robot.positioning != "Intern"]
+    captured = [*filter(_captured, robots)]
     waiting = [robot for robot in robots if "EventBased" in robot.controller.protocol + robot.controller_type]
     left = sum(len(robot.task.written) for robot in idle)
     rows = {
@@ -214,6 +220,9 @@ def _notes_on_robots(park: ParkExperiment) -> Iterator[str]:
             *filter(_body, robots)
         ],
         "positioning Extern ({}): the motion capture's address is not in their file; its twin is taken": captured,
+        "positioning Extern of twins ({}): no motion capture sees them; they know their poses": [
+            robot for robot in outside if robot not in captured
+        ],
         "{}: position controllers that act on events; zenpark's run at every tick": waiting,
         f"task.enable is False for {{}}: {left} relations are left out, and these robots have no neighbours": idle,
     }

@@ -438,4 +438,8 @@ def test_source_of_positions_is_used():
     assert unused.severity == "warning"
     published = findings(document.read(TRIANGLE, [external]), ["event"])["position-published"]
     assert published.message == "CF01: positions from outside, by a program that publishes park/CF01/position"
-    assert not {*findings(document.read(TRIANGLE, [source, external]), ["event"])} & {unused.code, published.code}
+    both = findings(document.read(TRIANGLE, [source, external]), ["event"])
+    assert not {*both} & {unused.code, published.code}
+    assert both["position-unseen"].remedy == 'write body = "crazyflie-twin"'
+    seen = findings(document.read(TRIANGLE, [source, external, 'robots.CF01.body="crazyflie-twin"']), ["event"])
+    assert "position-unseen" not in seen
