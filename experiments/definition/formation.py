@@ -98,11 +98,11 @@ class Pattern:
             [(each.since, each.until, each.reach, each.release) for each in self.one_way]
         ).T
         within = (since - ROUNDING_S <= time[:, None]) & (time[:, None] < until - ROUNDING_S)
-        present, now = np.empty(apart.shape, dtype=bool), self.planned_at(0.0)
-        for k, far in enumerate(apart):
-            limit = np.where(now, release, reach)
-            present[k] = now = within[k] & ((limit == math.inf) | (far <= limit))
-        return present
+        begins, stays = (within & ((limit == math.inf) | (apart <= limit)) for limit in (reach, release))
+        # a link that would neither begin nor end is as it was: `release` is not nearer than `reach`
+        decided = np.where(begins | ~stays, np.arange(len(apart))[:, None], -1)
+        last = np.maximum.accumulate(decided, axis=0)
+        return np.where(last < 0, self.planned_at(0.0), np.take_along_axis(begins, np.maximum(last, 0), axis=0))
 
     def exists(self, number: int, elapsed: float, apart: float, *, was: bool) -> bool:
         """Whether a link between robots `apart` [m] exists `elapsed` [s] after the start; `was`: it did before."""

@@ -17,8 +17,9 @@ import msgspec
 import numpy as np
 
 from agents.decision.lifecycle import AIRBORNE
-from agents.plugins.planners import NO_TARGET, Itinerary
+from agents.plugins.planners import Itinerary
 from agents.robot import Robot
+from agents.vectors import UNKNOWN
 from experiments.definition.plan import Plan
 from experiments.virtual_time import machine, tick
 from experiments.virtual_time.network import Arrived, VirtualNetwork
@@ -36,13 +37,12 @@ OFTEN_S: Final = 20.0  # [s] following work for which a second of `cc` pays
 LONGEST: Final = 10_000  # ticks of a stretch
 ROBOT_TICKS: Final = 1_000_000  # ticks of all its robots: noise is drawn, and room kept, for all of them beforehand
 LEAST: Final = 20  # ticks below which a stretch is followed by a pause
-PAUSE: Final = 10  # ticks that are flown in plain Python, twice as many after the next short stretch
-LONGEST_PAUSE: Final = 160  # ticks of the longest pause
+PAUSE: Final = 40  # ticks that are flown in plain Python then
 AHEAD_S: Final = 5.0  # [s] most that a run takes from its begin to the common start, about
 ROOM: Final = 2  # more samples on a link than its delay asks for
 LATE, LATEST_S = 40.0, 60.0  # room for jitter: times its mean, of which one in 10¹⁷ is more, and [s]
 DRIVER: Final = """
-def stretch(crew, k, end, dt, log_every, instant):
+def stretch(crew, k, end, leg, dt, log_every, instant):
     ledger = crew.ledger
     t = k * dt
     while ledger.moves or k < end:
@@ -63,7 +63,7 @@ def stretch(crew, k, end, dt, log_every, instant):
             {deliver}
             moves = False
             {observe}
-            if moves:
+            if moves or k == leg:
                 ledger.moves = True
                 return k
         ledger.moves = False
@@ -78,7 +78,7 @@ def stretch(crew, k, end, dt, log_every, instant):
     return k
 """
 TYPES: Final[dict[str, Any]] = {WHOLE: ctypes.c_int64, DOUBLE: ctypes.c_double, BOOLEAN: ctypes.c_bool}
-GIVEN: Final = (WHOLE, WHOLE, DOUBLE, WHOLE, BOOLEAN)  # arguments of the driver behind the crew
+GIVEN: Final = (WHOLE, WHOLE, WHOLE, DOUBLE, WHOLE, BOOLEAN)  # arguments of the driver behind the crew
 WORK: Final = [0.0, 0.0]  # seconds of plain Python that flights of this process take, about, and that were announced
 REFUSED: Final[dict[str, str]] = {}  # reason by law or crew why it cannot be compiled
 DRIVERS: Final[dict[RecordLayout, CompiledLoop]] = {}  # drivers of this process
@@ -193,8 +193,7 @@ class Stretches:
         self._plans, self._itineraries = dict[int, PlannedTargets](), dict[int, Itinerary]()
         self.flown, self.refusal = 0, ""
         self._prepared: Prepared | None = None
-        self._paused_until, self._pause = 0, PAUSE
-        self._refused = False
+        self._paused_until, self._refused = 0, False
         self._image: Image | None = None
         self._before: Sequence[Arrived] = ()
 
@@ -210,7 +209,7 @@ class Stretches:
         longest = max(min(LONGEST, ROBOT_TICKS // len(flight.robots)), LEAST)
         soon = k * flight.dt + AHEAD_S
         ends = (soon if np.isnan(flight.start_at) else flight.start_at) + duration_s
-        end = min(k + longest, self._next_leg(k), round(max(ends, soon) / flight.dt))
+        end = min(k + longest, round(max(ends, soon) / flight.dt))
         if self._refused or k < self._paused_until or end - k < LEAST:
             return False
         if not all(_goes_on(robot, (k + 1) * flight.dt) for robot in flight.robots):
@@ -227,7 +226,12 @@ class Stretches:
             member.twin.reserve(ticks)
         self._before = flight.network.board(self._ways)
         self._begun, self.tick, self.end = k, k, end
-        self._plan(k, end)
+        for row, robot in enumerate(flight.robots):
+            if robot.goals.itinerary is not None:
+                self._itineraries[row], every = robot.goals.itinerary, robot.assignment.decide_every
+                self._plans[row] = PlannedTargets(robot.assignment.body_hz / every, ticks // every + ROOM)
+                robot.goals.itinerary = self._plans[row]  # type: ignore[assignment]
+        self._plan(k)
         prepared = self._prepared or RECENT.get(self._case)
         if prepared is not None and (self._prepared is not None or not prepared.driver.program.changed()):
             self._image = self._stored(prepared, ledger)
@@ -256,7 +260,7 @@ class Stretches:
         self.moved = False
         if steps.stage is None:
             words, samples = image.words.copy(), [array("d", way.samples) for way in self._ways]
-        given = (self.tick, end, flight.dt, flight.log_every, flight.network.instant, steps.address)
+        given = (self.tick, end, self._leg, flight.dt, flight.log_every, flight.network.instant, steps.address)
         found = prepared.driver.run(image.address(image.roots[0][0]), *given)
         if found >= 0:
             self.tick = found
@@ -275,13 +279,12 @@ class Stretches:
         return False
 
     def _live(self, image: Image, t: float) -> bool:
-        """Phases move on at `t` [s]; returns False where more comes of it than a take-off or the common start."""
+        """Phases and plans move on at `t` [s]; returns False where it is more than a take-off or the common start."""
         robots, twins = self._flight.robots, self._flight.twin.twins
         image.read(part for each in robots for part in (each.lifecycle, each.now, each.now.state, each.landing))
         moving = [row for row, robot in enumerate(robots) if not robot.is_steady(t)]
-        stays = self._to_start or self._itineraries
         for life, lands_at in ((robots[row].lifecycle, robots[row].assignment.lands_at) for row in moving):
-            if not (life.climbing or (life.phase == AIRBORNE and not stays and lands_at == np.inf)):
+            if not (life.climbing or (life.phase == AIRBORNE and not self._to_start and lands_at == np.inf)):
                 return False
         for row in moving:
             robot, motion = robots[row], twins[row].motion
@@ -291,6 +294,10 @@ class Stretches:
                 self._flight.twin.takeoff((row,), (robot.assignment.hover,))
                 robot.takes_off = False
             image.write([robot, robot.lifecycle, robot.landing, motion])
+        if self._itineraries:
+            image.read(robots)
+            self._plan(self.tick)
+            image.write(self._plans.values())
         return True
 
     def order(self, give: Callable[[], object]) -> None:
@@ -326,9 +333,7 @@ class Stretches:
             flight.robots[row].goals.itinerary = itinerary
         self._itineraries.clear()
         if k - self._begun < LEAST:
-            self._paused_until, self._pause = k + self._pause, min(2 * self._pause, LONGEST_PAUSE)
-        else:
-            self._pause = PAUSE
+            self._paused_until = k + PAUSE
         self.flown += k - self._begun
         flight.network.leave(self._ways, ledger, self._before, k * flight.dt)
         flight.note(ledger, self._steps)
@@ -366,37 +371,23 @@ class Stretches:
         RECENT[self._case] = found = Prepared(rows, layout, driver(layout, len(rows), plan.names, often=often))
         return found
 
-    def _next_leg(self, k: int) -> int:
-        """Tick on which the next leg of a plan begins, or a later one; those of a decision around it are plain.
-
-        `k`: present tick.
-        """
-        flight, first = self._flight, sys.maxsize
-        for robot in flight.robots:
-            itinerary, begin = robot.goals.itinerary, robot.lifecycle.start_at
-            if itinerary is not None and not robot.begun:
-                first = min(first, k + round(AHEAD_S / flight.dt))
-            elif itinerary is not None and itinerary.next_at < np.inf:
-                first = min(first, int((begin + itinerary.next_at) / flight.dt) - 1)
-        return first
-
-    def _plan(self, k: int, end: int) -> None:
-        """Plans of the robots, computed for all decisions of a stretch, in place of their itineraries."""
-        flight = self._flight
-        for row, robot in enumerate(flight.robots):
-            itinerary = robot.goals.itinerary
-            if itinerary is None:
-                continue
-            self._itineraries[row] = itinerary
+    def _plan(self, k: int) -> None:
+        """Targets of the decisions from tick `k` on, until the next leg of a plan: robots begin it where they are."""
+        flight, self._leg = self._flight, sys.maxsize
+        for row, itinerary in self._itineraries.items():
+            robot, planned = flight.robots[row], self._plans[row]
             every, begin = robot.assignment.decide_every, robot.lifecycle.start_at
-            hz, first = robot.assignment.body_hz / every, robot.tick // every
-            place, targets = (np.nan, np.nan, np.nan), []
-            for number in range(first, first + (end - k) // every + 2):
-                t = (k + number * every - robot.tick) * flight.dt
-                targets.append(itinerary.target(t - begin, place, np.nan) if robot.begun else NO_TARGET)
-            planned = self._plans.setdefault(row, PlannedTargets(hz))
-            planned.first, planned.targets = first, targets
-            robot.goals.itinerary = planned  # type: ignore[assignment]
+            now = robot.now
+            planned.first = first = robot.tick // every
+            place = (now.position[0], now.position[1], robot.goals.ground) if robot.tick % every == 0 else UNKNOWN
+            for number in range(first, first + len(planned.targets) // 4 if robot.begun else first):
+                tick = k + number * every - robot.tick
+                if number > first and tick * flight.dt - begin >= itinerary.next_at - 1e-9:
+                    self._leg = min(self._leg, tick)
+                    break
+                target = itinerary.target(tick * flight.dt - begin, place, now.yaw)
+                planned.targets[4 * (number - first) : 4 * (number - first) + 4] = array("d", target)
+                place = UNKNOWN
 
 
 def _goes_on(robot: Robot, t: float) -> bool:

@@ -13,7 +13,6 @@ from typing import ClassVar, Final
 from agents.decision.neighbours import Neighbour
 from agents.decision.stepping import Speech, Stepping
 from agents.network.channel_model import ROUNDING_S, LinkChannel
-from agents.plugins.planners import NO_TARGET
 from agents.robot import Robot
 from agents.vectors import Pose, Vector
 from experiments.virtual_time.records import MEASURES, numbers
@@ -118,15 +117,16 @@ class PlannedTargets:
 
     first: int  # number of the decision of the first target
     decide_hz: float  # [1/s]
-    targets: list[Pose]
+    targets: array[float]  # four numbers of each
 
-    def __init__(self, decide_hz: float) -> None:
+    def __init__(self, decide_hz: float, decisions: int) -> None:
         self.first, self.decide_hz = 0, decide_hz
-        self.targets = [NO_TARGET]
+        self.targets = array("d", (nan,)) * (4 * decisions)
 
     def target(self, t: float, position: Vector, yaw: float) -> Pose:
         """As `Itinerary.target`, at the time of a decision."""
-        return self.targets[round(t * self.decide_hz) - self.first]
+        k, targets = 4 * (round(t * self.decide_hz) - self.first), self.targets
+        return targets[k], targets[k + 1], targets[k + 2], targets[k + 3]
 
 
 class Ledger:
