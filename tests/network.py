@@ -66,19 +66,19 @@ class Channel:
 
     def __init__(self, key: str, *, asked: bool = False, depth: int = 64) -> None:
         self.key, self.asked, self.expression = key, asked, zenoh.KeyExpr(key)
-        self.waiting: deque[Sample] = deque(maxlen=depth)
+        self.queue: deque[Sample] = deque(maxlen=depth)
         self.handler = self
         self.obey: Callable[[Sample], object] = lambda _sample: None
 
     def try_recv(self) -> Sample | None:
-        return self.waiting.popleft() if self.waiting else None
+        return self.queue.popleft() if self.queue else None
 
     def add(self, sample: Sample) -> None:
-        self.waiting.append(sample)
+        self.queue.append(sample)
         self.obey(sample)
 
     def undeclare(self, *_: object) -> None:
-        self.waiting.clear()
+        self.queue.clear()
 
     def __enter__(self) -> Self:
         return self
@@ -101,7 +101,7 @@ class _Closing:
 class Mute(_Closing):
     """The end of a key that speaks, a token, a last value: nobody listens."""
 
-    waiting = ()
+    queue = ()
 
     def put(self, payload: bytes, **_: object) -> None:
         assert isinstance(payload, bytes)

@@ -30,7 +30,7 @@ DEPENDENT = re.compile(
     re.IGNORECASE,
 )
 # names of values that are pronouns or participles
-PRONOUNS = {"mine", "ours", "theirs", "its", "whose", "those", "there", "told", "waits", "unknown"}
+PRONOUNS = {"mine", "ours", "theirs", "its", "whose", "those", "there", "told", "waiting", "waits", "unknown"}
 FENCE = re.compile(r"^ *(```|~~~).*?^ *\1|^(?: {4,}[^\n]*\n)+", re.MULTILINE | re.DOTALL)
 COMMENT = re.compile(r"(?:^|(?<=\s))#.*")  # in a text of several lines, what looks like one as well
 ITEM = re.compile(r"\n\s*\n|\n(?=\s*(?:[-*|>#]|\d+\.|`?\w[\w., ]*`?:) )")

@@ -59,11 +59,11 @@ class _Lasting:
     def _is_read(self) -> bool:
         """Whether the reader takes more: a terminal may be stopped, and a pipe full."""
         try:
-            waiting = select.poll()
-            waiting.register(self._stream.fileno(), select.POLLOUT)
+            poll = select.poll()
+            poll.register(self._stream.fileno(), select.POLLOUT)
         except (OSError, ValueError):  # no file
             return True
-        return bool(waiting.poll(1e3 * STALL_S))
+        return bool(poll.poll(1e3 * STALL_S))
 
     @contextmanager
     def _dropping(self) -> Iterator[None]:

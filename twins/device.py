@@ -123,7 +123,7 @@ class FaultyLink(Generic[Item]):
         self.t = 0.0  # current time [s]; set by the device
         self.faults, self._random = faults, random
         self._outage = (inf, -inf)  # begin and end [s]
-        self._waiting: deque[tuple[float, Item]] = deque()
+        self._queue: deque[tuple[float, Item]] = deque()
 
     def silence(self, seconds: float) -> None:
         """Begin an outage: nothing is received in either direction."""
@@ -140,12 +140,12 @@ class FaultyLink(Generic[Item]):
 
     def put(self, item: Item) -> None:
         """Queue what the device sends now."""
-        self._waiting.append((self.t + self.faults.delay_s, item))
+        self._queue.append((self.t + self.faults.delay_s, item))
 
     def due(self) -> Iterator[Item]:
         """Take what is to be sent by now out of the queue."""
-        while self._waiting and self._waiting[0][0] <= self.t:
-            yield self._waiting.popleft()[1]
+        while self._queue and self._queue[0][0] <= self.t:
+            yield self._queue.popleft()[1]
 
 
 class Server(ABC):

@@ -58,20 +58,20 @@ class Framer:
     def __init__(self, head: struct.Struct, length: Callable[..., int]) -> None:
         """Take the layout of a head, and the length of its body by its values, which may raise MalformedStream."""
         self._head, self._length = head, length
-        self._waiting = bytearray()
+        self._unread = bytearray()
 
     def feed(self, received: bytes) -> list[Packet]:
         """Last value of the head, and body, of the packets that are complete now, oldest first."""
-        waiting = self._waiting
-        waiting += received
+        unread = self._unread
+        unread += received
         found, at = list[Packet](), 0
-        while len(waiting) - at >= self._head.size:
-            values = self._head.unpack_from(waiting, at)
+        while len(unread) - at >= self._head.size:
+            values = self._head.unpack_from(unread, at)
             begin = at + self._head.size
             end = begin + self._length(*values)
-            if end > len(waiting):
+            if end > len(unread):
                 break
-            found.append((values[-1], bytes(waiting[begin:end])))
+            found.append((values[-1], bytes(unread[begin:end])))
             at = end
-        del waiting[:at]
+        del unread[:at]
         return found

@@ -100,10 +100,10 @@ def parse_server(server: str, port: int) -> tuple[str, int]:
 
 def readable(sockets: Sequence[socket.socket], deadline: float) -> bool:
     """Wait until one of the sockets has something to read; False at the deadline of `time.monotonic()` [s]."""
-    waiting = select.poll()
+    poll = select.poll()
     for each in sockets:
-        waiting.register(each, select.POLLIN)
-    return bool(waiting.poll(1000.0 * max(0.0, deadline - time.monotonic())))
+        poll.register(each, select.POLLIN)
+    return bool(poll.poll(1000.0 * max(0.0, deadline - time.monotonic())))
 
 
 def _received(connection: socket.socket) -> bytes:

@@ -109,11 +109,11 @@ class PoseSubscriber:
 
     def __init__(self, session: zenoh.Session, key: str, depth: int, kept: int, bell: Bell | None) -> None:
         """Subscribes; see `pose_subscriber`."""
-        self._waiting = deque[zenoh.Sample](maxlen=depth)
+        self._samples = deque[zenoh.Sample](maxlen=depth)
         self._numbers: dict[str, int] = {}  # last source number, by source
 
         def append(sample: zenoh.Sample) -> None:  # runs under a lock of the subscriber: it may only append and ring
-            self._waiting.append(sample)
+            self._samples.append(sample)
             if bell is not None:
                 bell.ring()
 
@@ -146,7 +146,7 @@ class PoseSubscriber:
         self._plain.undeclare()
 
     def _pop(self) -> zenoh.Sample | None:
-        return self._waiting.popleft() if self._waiting else None
+        return self._samples.popleft() if self._samples else None
 
     def _repeats_its_number(self, sample: zenoh.Sample) -> bool:
         """Whether the number of a sample is not greater than the last one of its source."""
@@ -301,7 +301,7 @@ class Inbox(Generic[M]):
 class CallbackQueue(Generic[T]):
     """A queue of rare items, filled by the receiving thread, emptied by polling.
 
-    Polling an empty one costs a tenth of polling an empty ring channel, and a look at `waiting` a tenth of that.
+    Polling an empty one costs a tenth of polling an empty ring channel, and a look at `queue` a tenth of that.
     Frequent items belong into a ring channel: each item here costs the receiving thread a wait for the interpreter's
     lock.
     """
@@ -313,27 +313,27 @@ class CallbackQueue(Generic[T]):
 
         An item that is `urgent` is never displaced: if all are, the new one is left out.
         """
-        self.waiting: deque[T] = deque()  # queued items
+        self.queue: deque[T] = deque()  # queued items
         self._depth, self._wanted, self._urgent = depth, wanted, urgent
         self._lock = threading.Lock()
         self.callback = Callback(self._append, indirect=False)
 
     def try_recv(self) -> T | None:
-        if not self.waiting:
+        if not self.queue:
             return None
         with self._lock:
-            return self.waiting.popleft()
+            return self.queue.popleft()
 
     def _append(self, item: T) -> None:
         if not self._wanted(item):
             return
         with self._lock:
-            if len(self.waiting) == self._depth:
-                displaced = next((number for number, each in enumerate(self.waiting) if not self._urgent(each)), None)
+            if len(self.queue) == self._depth:
+                displaced = next((number for number, each in enumerate(self.queue) if not self._urgent(each)), None)
                 if displaced is None:
                     return
-                del self.waiting[displaced]
-            self.waiting.append(item)
+                del self.queue[displaced]
+            self.queue.append(item)
 
 
 class ImmediateSubscriber:
@@ -349,11 +349,11 @@ class ImmediateSubscriber:
     ) -> None:
         """Subscribes: each stop is given to `obey`; the newest `depth` wait to be polled from then on."""
         self._obey = obey
-        self.waiting: deque[messages.Stop] = deque(maxlen=depth)  # stops to be polled
+        self.queue: deque[messages.Stop] = deque(maxlen=depth)  # stops to be polled
         self._subscriber = session.declare_subscriber(key, Callback(self.receive, indirect=False))
 
     def try_recv(self) -> messages.Stop | None:
-        return self.waiting.popleft() if self.waiting else None
+        return self.queue.popleft() if self.queue else None
 
     def close(self) -> None:
         self._subscriber.undeclare()
@@ -367,7 +367,7 @@ class ImmediateSubscriber:
         try:
             self._obey(stop)
         finally:  # not before: a loop that polls in between would take it for obeyed already
-            self.waiting.append(stop)
+            self.queue.append(stop)
 
 
 # ---------------------------------------------------------------------- queries
@@ -382,7 +382,7 @@ class Orders(Generic[M]):
     def __init__(self, session: zenoh.Session, key: str, kind: type[M]) -> None:
         self._kind, self.malformed = kind, 0  # refused payloads
         self._queries = CallbackQueue[zenoh.Query](ORDERS, urgent=_ends_flight)
-        self.waiting = self._queries.waiting  # queued
+        self.queue = self._queries.queue  # queued
         self._queryable = session.declare_queryable(key, self._queries.callback, complete=True)
 
     def read(self) -> Iterator[tuple[zenoh.Query, M]]:
@@ -431,7 +431,7 @@ class LastValue:
         self.mime = mime
         self._payload: bytes | None = None
         self._queries = CallbackQueue[zenoh.Query](ORDERS)
-        self.waiting = self._queries.waiting  # queued
+        self.queue = self._queries.queue  # queued
         self._queryable = session.declare_queryable(key, self._queries.callback)  # lives as long as it is referenced
 
     def hold(self, payload: bytes) -> None:
@@ -465,7 +465,7 @@ class AliveWatch:
 
     def __init__(self, session: zenoh.Session, keyexpr: str) -> None:
         self.handler = CallbackQueue[zenoh.Sample](TOKEN_CHANGES, lambda sample: "*" not in str(sample.key_expr))
-        self.waiting = self.handler.waiting  # queued changes
+        self.queue = self.handler.queue  # queued changes
         self._subscriber = session.liveliness().declare_subscriber(keyexpr, self.handler.callback, history=True)
 
     def changes(self) -> Iterator[tuple[str, bool]]:

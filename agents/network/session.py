@@ -271,7 +271,7 @@ class RouterWatch:
         """Begins with the first `silent_since`; in a lab, `key` is a liveliness key that this session may watch."""
         self._session, self._key = session, key
         self._others = len(endpoints) > 1
-        self._waiting: deque[tuple[float, Polled[zenoh.Reply]]] = deque(maxlen=ASKED)
+        self._questions: deque[tuple[float, Polled[zenoh.Reply]]] = deque(maxlen=ASKED)
         # Times of a clock that stands between polls: a process that gets no processor cannot blame the router.
         self._now, self._asked = 0.0, -inf
         self._unanswered = inf  # time of the oldest question [s]
@@ -296,7 +296,7 @@ class RouterWatch:
         self._looked = t
         info = self._session.info
         if not info.routers_zid():
-            self._waiting.clear()
+            self._questions.clear()
             self._asked, self._unanswered = -inf, inf
             self._answers, self._left = 0, self._now
             self._silent_since = inf if info.peers_zid() else min(self._silent_since, t)
@@ -311,7 +311,7 @@ class RouterWatch:
         if arrived != self._arrived:
             self._arrived = arrived
             if self._silent_since == inf:
-                self._waiting.clear()
+                self._questions.clear()
                 self._asked, self._unanswered = self._now, inf
         if self._now - self._unanswered > ANSWER_S and self._silent_since == inf:
             self._silent_since, self._answers = t - (self._now - self._unanswered), 0
@@ -322,22 +322,22 @@ class RouterWatch:
             hang_up(self._session)
         if self._now - self._asked >= ASK_EVERY_S:
             handler = self._session.liveliness().get(self._key, RingChannel(1), timeout=10.0 * ASKED * ASK_EVERY_S)
-            self._waiting.append((self._now, handler))
+            self._questions.append((self._now, handler))
             self._asked = self._now
             self._unanswered = min(self._unanswered, self._now)
         return self._silent_since
 
     def _answered(self) -> bool:
         """Whether a reply has arrived since the last call."""
-        for number in reversed(range(len(self._waiting))):
-            _, handler = self._waiting[number]
+        for number in reversed(range(len(self._questions))):
+            _, handler = self._questions[number]
             try:
                 while handler.try_recv() is not None:
                     pass
             except zenoh.ZError:  # the answer is complete
                 for _ in range(number + 1):
-                    self._waiting.popleft()
-                self._unanswered = self._waiting[0][0] if self._waiting else inf
+                    self._questions.popleft()
+                self._unanswered = self._questions[0][0] if self._questions else inf
                 return True
         return False
 

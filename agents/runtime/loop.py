@@ -309,12 +309,12 @@ class Runtime:
 
     def _receive(self, t: float) -> None:
         health = self.health
-        for _, stands in self._conductor.changes() if self._conductor.waiting else ():
+        for _, stands in self._conductor.changes() if self._conductor.queue else ():
             health.conductor_lost_since = inf if stands else min(health.conductor_lost_since, t)
         self._neighbours.deliver(t, self._utc)
         if self._goals is not None:
             self._goals.receive(t, self._utc)
-        if self.estop.waiting:
+        if self.estop.queue:
             self._apply_stops()
         if (located := self._located) is not None:
             for row, taken, position, yaw in located.receive(self._utc, t):
@@ -323,7 +323,7 @@ class Runtime:
                     self._body.locate(row, taken, position, robot.believed_yaw(taken, yaw))
         self._orders.answer(t, self._utc, self.states)
         for last in self._last:
-            if last.waiting:
+            if last.queue:
                 last.answer()
 
     def _read(self, t: float) -> Sequence[BodyState]:

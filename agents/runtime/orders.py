@@ -60,7 +60,7 @@ class OrderDesk:
     def answer(self, t: float, utc: float, states: Sequence[BodyState]) -> None:
         """Answers all until `t` [s] of a clock that was 0 at `utc` [s]; `states`: last reading of the body, if any."""
         for row, inbox in enumerate(self._inboxes):
-            for query, order in inbox.read() if inbox.waiting else ():
+            for query, order in inbox.read() if inbox.queue else ():
                 with query:
                     reply = self._obey(row, order, t, utc, states)
                     payload = messages.encode(reply, self._encoding)

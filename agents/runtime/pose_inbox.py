@@ -65,7 +65,7 @@ class NeighbourSubscription:
         self.take = self._poses.take  # the next queued sample, or None
         self._token = keys.alive(name)
         self._alive = pubsub.AliveWatch(session, keys.lives(self._token))
-        self.tokens = self._alive.waiting  # queued for `token_changes`, nearly always none
+        self.tokens = self._alive.queue  # queued for `token_changes`, nearly always none
         self._order = PoseOrder()
         self.alive: bool | None = None  # its plain token stands; None: never seen
         self._received_at = -inf  # last new pose (UTC [s])

@@ -438,9 +438,9 @@ class CrazyfliePilot:
         until = uptime() + seconds
         while True:
             self._check(link)
-            waiting = "" if self._order is None else self._order[0]
-            coming_down = waiting == "land" or self._ending.is_set()
-            if waiting == "stop" or (coming_down and self._executing == "takeoff"):
+            order = "" if self._order is None else self._order[0]
+            coming_down = order == "land" or self._ending.is_set()
+            if order == "stop" or (coming_down and self._executing == "takeoff"):
                 raise OrderReplaced
             now = uptime()
             self._forward_external_pose(link, now)

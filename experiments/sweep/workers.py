@@ -52,14 +52,16 @@ class Workers:
                 yield work, self._checked(fly(work.case, work.seeds, work.code, work.plain_s))
             return
         # processes of a pool are started as the work comes in
-        waiting = {self.executor.submit(fly, work.case, work.seeds, work.code, work.plain_s): work for work in works}
+        works_by_future = {
+            self.executor.submit(fly, work.case, work.seeds, work.code, work.plain_s): work for work in works
+        }
         try:
-            for future in as_completed(waiting):
-                yield waiting[future], self._checked(future.result())
+            for future in as_completed(works_by_future):
+                yield works_by_future[future], self._checked(future.result())
         except self.failures as error:
             raise ExplainedError(f"{self.reason(error)}; what is done is kept: give the same command again") from None
         finally:
-            for future in waiting:
+            for future in works_by_future:
                 future.cancel()
 
     def _checked(self, answer: bytes) -> WorkResult:

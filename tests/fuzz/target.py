@@ -90,12 +90,12 @@ class Wire:
     """A socket without a network, fed by hand."""
 
     def __init__(self):
-        self.waiting = deque()
+        self.queue = deque()
 
     def recvfrom(self, most):
-        if not self.waiting:
+        if not self.queue:
             raise BlockingIOError
-        return self.waiting.popleft()[:most], ("127.0.0.1", 9)
+        return self.queue.popleft()[:most], ("127.0.0.1", 9)
 
     def recv(self, most):
         return self.recvfrom(most)[0]

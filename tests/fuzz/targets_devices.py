@@ -56,8 +56,8 @@ def khepera_twin():
             device = devices.get(data[:1].decode("ascii", "replace"), devices["p"])
             wire, server = Wire(), device.servers[0]
             server.client = wire
-            wire.waiting += [data[1:256], data[256:512]] if len(data) > 256 else [data[1:]]
-            while wire.waiting:
+            wire.queue += [data[1:256], data[256:512]] if len(data) > 256 else [data[1:]]
+            while wire.queue:
                 device.serve(wire, 0.02 * k)
             for t in (0.02 * k + 0.01, 0.02 * k + 0.02):
                 device.advance(t)
@@ -201,8 +201,8 @@ def vicon_twin():
     def take(data):
         t, wire = 0.01 * next(ticks), Wire()
         twin.clients = {wire: twin.new_client()}
-        wire.waiting += [data[:3000], data[3000:]] if len(data) > 3000 else [data]
-        while wire.waiting and wire in twin.clients:
+        wire.queue += [data[:3000], data[3000:]] if len(data) > 3000 else [data]
+        while wire.queue and wire in twin.clients:
             twin.serve(wire, t)
         twin.advance(t)
 
@@ -270,10 +270,10 @@ def crazyflie_twin():
         line.socket = wire
         for k in count():
             data, at = (yield), 0
-            while at < len(data) and len(wire.waiting) < 40:
-                wire.waiting.append(data[at + 1 : at + 1 + data[at]] or b"\0")
+            while at < len(data) and len(wire.queue) < 40:
+                wire.queue.append(data[at + 1 : at + 1 + data[at]] or b"\0")
                 at += 1 + data[at]
-            while wire.waiting:
+            while wire.queue:
                 device.serve(own, 0.03 * k)
             for step in (1, 2, 3):
                 device.advance(0.03 * k + 0.01 * step)

@@ -125,14 +125,14 @@ class RequestFramer(Framer):
     """Waits for the end of a request of HTTP."""
 
     def __init__(self) -> None:
-        self._waiting = bytearray()
+        self._unread = bytearray()
 
     def feed(self, received: bytes) -> list[Packet]:
-        self._waiting += received
-        if b"\r\n\r\n" in self._waiting:
-            request, self._waiting = bytes(self._waiting), bytearray()
+        self._unread += received
+        if b"\r\n\r\n" in self._unread:
+            request, self._unread = bytes(self._unread), bytearray()
             return [(0, request)]
-        if len(self._waiting) > 1 << 16:
+        if len(self._unread) > 1 << 16:
             raise MalformedStream("no request of HTTP")
         return []
 

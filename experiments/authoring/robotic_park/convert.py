@@ -212,7 +212,7 @@ def _notes_on_robots(park: ParkExperiment) -> Iterator[str]:
     homeless = [robot for robot in robots if robot.type != "virtual" and not _body(robot)]
     outside = [robot for robot in robots if robot.positioning != "Intern"]
     captured = [*filter(_captured, robots)]
-    waiting = [robot for robot in robots if "EventBased" in robot.controller.protocol + robot.controller_type]
+    by_events = [robot for robot in robots if "EventBased" in robot.controller.protocol + robot.controller_type]
     left = sum(len(robot.task.written) for robot in idle)
     rows = {
         "{}: real, but without an address of a known kind; twins instead": homeless,
@@ -223,7 +223,7 @@ def _notes_on_robots(park: ParkExperiment) -> Iterator[str]:
         "positioning Extern of twins ({}): no motion capture sees them; they know their poses": [
             robot for robot in outside if robot not in captured
         ],
-        "{}: position controllers that act on events; zenpark's run at every tick": waiting,
+        "{}: position controllers that act on events; zenpark's run at every tick": by_events,
         f"task.enable is False for {{}}: {left} relations are left out, and these robots have no neighbours": idle,
     }
     yield from (note.format(join_names([robot.name for robot in group])) for note, group in rows.items() if group)

@@ -120,8 +120,8 @@ class Station:
         assert stdin is not None
         assert stdout is not None
         self._out, self._in = stdin, stdout
-        self._waiting = select.poll()
-        self._waiting.register(stdout.fileno(), select.POLLIN)
+        self._poll = select.poll()
+        self._poll.register(stdout.fileno(), select.POLLIN)
         self._rest = b""
         self._starting: list[Process] = []
         self._robots: list[Process] = []
@@ -167,7 +167,7 @@ class Station:
         # the output of ssh tells the reason; where the pipe is full, the station is silent
         with suppress(BrokenPipeError, BlockingIOError):
             os.write(self._out.fileno(), text)
-        while self._waiting.poll(max(0.0, deadline - time.monotonic()) * 1e3):
+        while self._poll.poll(max(0.0, deadline - time.monotonic()) * 1e3):
             data = os.read(self._in.fileno(), 65536)
             back = self._clock.utc()
             if not data:

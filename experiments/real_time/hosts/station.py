@@ -217,11 +217,11 @@ def serve(fd: int = 0, patience_s: float = LAND_S) -> int:
     """Answer until the lifeline is lost, then wait for `patience_s` [s] until the robots are down; return 0."""
     here = Clock()
     decoder = msgspec.json.Decoder(Question)
-    waiting = select.poll()
-    waiting.register(fd, select.POLLIN)
+    poll = select.poll()
+    poll.register(fd, select.POLLIN)
     rest = b""
     with contextlib.suppress(OSError), contextlib.ExitStack() as until_lost:  # OSError: the other end is closed
-        while waiting.poll(FAR_SILENCE_S * 1e3):
+        while poll.poll(FAR_SILENCE_S * 1e3):
             data = os.read(fd, 65536)
             clock = here.utc()
             if not data:

@@ -50,7 +50,7 @@ class Recorder:
         self._truths = self._inbox(pubsub.subscriber(session, keys.truth("*"), DEPTH), messages.Position)
         self._truth: dict[str, deque[messages.Position]] = {}
         # states that wait for truth: since when [s, monotonic], and the MIME types of their payloads
-        self._waiting: dict[str, deque[tuple[float, messages.State, str]]] = {}
+        self._queues: dict[str, deque[tuple[float, messages.State, str]]] = {}
         self._watch = pubsub.AliveWatch(session, keys.alive("*"))
         self._token = pubsub.alive_token(session, keys.recorder)
 
@@ -66,10 +66,10 @@ class Recorder:
         for event in self._world_events.read(validation.check_world_event):
             self._recording.write(event)
         now = time.monotonic()
-        for robot, waiting in self._waiting.items():
+        for robot, queue in self._queues.items():
             truths = self._truth[robot]
-            while waiting and (last or waiting[0][1].stamp <= truths[-1].stamp or now - waiting[0][0] > PATIENCE_S):
-                _, state, mime = waiting.popleft()
+            while queue and (last or queue[0][1].stamp <= truths[-1].stamp or now - queue[0][0] > PATIENCE_S):
+                _, state, mime = queue.popleft()
                 self._recording.write(with_truth(state, truths), mime=mime)
 
     def report_malformed(self, *, last: bool = False) -> None:
@@ -98,7 +98,7 @@ class Recorder:
     def _store(self, message: Message, sample: zenoh.Sample) -> None:
         mime = str(sample.encoding)
         if isinstance(message, messages.State) and message.true_position is None and message.robot in self._truth:
-            self._waiting.setdefault(message.robot, deque()).append((time.monotonic(), message, mime))
+            self._queues.setdefault(message.robot, deque()).append((time.monotonic(), message, mime))
         else:
             self._recording.write(message, sample.payload.to_bytes(), mime)
 

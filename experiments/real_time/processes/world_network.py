@@ -213,19 +213,19 @@ class States:
     def restore(self, alive: Set[str]) -> dict[str, bool]:
         """Places simulated robots that are `alive` at the poses of their states: their names, and whether they fly."""
         carried = zip(self._names, self._population.carried, strict=True)
-        waiting = {name: self._states_of(name) for name, here in carried if here and name in alive}
+        silent = {name: self._states_of(name) for name, here in carried if here and name in alive}
         found: dict[str, bool] = {}
         deadline, pause = time.monotonic() + ANSWER_S, threading.Event()
-        while waiting and time.monotonic() < deadline:
+        while silent and time.monotonic() < deadline:
             pause.wait(0.01)
-            for name, inbox in list(waiting.items()):
+            for name, inbox in list(silent.items()):
                 state = self._newest(inbox)
                 if state is None or state.position is None:
                     continue
                 found[name] = state.position[2] > IN_AIR_M and state.phase in UP
                 self._population.put(name, state.position, state.yaw or 0.0, flying=found[name])
-                waiting.pop(name).close()
-        for inbox in waiting.values():
+                silent.pop(name).close()
+        for inbox in silent.values():
             inbox.close()
         return found
 

@@ -134,9 +134,9 @@ class Forked:
 
 
 def _readable(fd: int, timeout_s: float | None) -> bool:
-    waiting = select.poll()
-    waiting.register(fd, select.POLLIN)
-    return bool(waiting.poll(None if timeout_s is None else 1e3 * timeout_s))
+    poll = select.poll()
+    poll.register(fd, select.POLLIN)
+    return bool(poll.poll(None if timeout_s is None else 1e3 * timeout_s))
 
 
 def fork(path: Path, request: Request, streams: Sequence[int], stdin: BinaryIO | None = None) -> Forked:
@@ -190,7 +190,7 @@ class Zygote:
         self._path = Path(listener.getsockname())
         # by pidfd: id, and the socket that gets the exit code
         self._children: dict[int, tuple[int, socket.socket]] = {}
-        self._waiting = select.poll()
+        self._poll = select.poll()
 
     def serve(self) -> Request | None:
         """Fork on request until the lifeline is lost; the starter of the zygote ends its processes before that.
@@ -198,9 +198,9 @@ class Zygote:
         Returns None in the zygote, at its end; in each forked process, the request that it must run.
         """
         for fd in (self._listener.fileno(), LIFELINE):
-            self._waiting.register(fd, select.POLLIN)
+            self._poll.register(fd, select.POLLIN)
         while True:
-            for fd, _ in self._waiting.poll():
+            for fd, _ in self._poll.poll():
                 if fd in self._children:
                     self._reap(fd)
                 elif fd == self._listener.fileno():
@@ -232,7 +232,7 @@ class Zygote:
                 os.close(fd)
         pidfd = os.pidfd_open(pid)
         self._children[pidfd] = pid, asker
-        self._waiting.register(pidfd, select.POLLIN)
+        self._poll.register(pidfd, select.POLLIN)
         with contextlib.suppress(OSError):  # the asker has gone
             socket.send_fds(asker, [str(pid).encode()], [pidfd])
         return None
@@ -252,7 +252,7 @@ class Zygote:
 
     def _reap(self, pidfd: int) -> None:
         pid, asker = self._children.pop(pidfd)
-        self._waiting.unregister(pidfd)
+        self._poll.unregister(pidfd)
         os.close(pidfd)
         _, status = os.waitpid(pid, 0)
         with contextlib.suppress(OSError):

@@ -218,7 +218,7 @@ def test_flood_of_queries_displaces_no_landing(order, encoding, orders):
     ask(start, 5, encoding)
     ask(ends, 1, encoding)
     ask(hold, 40, encoding)
-    assert len(orders.waiting) == pubsub.ORDERS
+    assert len(orders.queue) == pubsub.ORDERS
     assert [given.order for _, given in orders.read()] == [order] + ["hold"] * (pubsub.ORDERS - 1)
     ask(ends, 40, encoding)
     ask(hold, 40, encoding)
