@@ -1,7 +1,10 @@
-"""Base of the errors that a user can mend: a command prints them without a traceback and ends with exit code 2."""
+"""Base of the errors that a user can mend, and what their texts share.
+
+A command prints them without a traceback and ends with exit code 2.
+"""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 
 class ExplainedError(Exception):
@@ -20,3 +23,9 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     if near:
         return f"did you mean '{lower[near[0]]}'?"
     return f"known: {', '.join(words)}" if words else ""
+
+
+def join_names(words: Sequence[str], most: int = 4) -> str:
+    """Words joined by commas; the last of many are counted."""
+    more = len(words) - most
+    return ", ".join(words) if more <= 0 else f"{', '.join(words[:most])} and {more} more"

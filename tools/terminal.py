@@ -10,6 +10,8 @@ from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdo
 from typing import Any, Final, TextIO, cast
 from unicodedata import category
 
+from agents.errors import join_names
+
 
 def printable(text: str) -> str:
     """Text of others on one line, with escapes in the place of what is no letter, mark, sign or space."""
@@ -27,8 +29,7 @@ def say(*texts: str, to: TextIO | None = None) -> None:
 
 def listed(names: Collection[str], most: int) -> str:
     """Names in order with commas between them; of more than `most` the first `most`, and the number of the others."""
-    first = ", ".join(sorted(names)[:most])
-    return first if len(names) <= most else f"{first} and {len(names) - most} more (--json names all)"
+    return join_names(sorted(names), most) + " (--json names all)" * (len(names) > most)
 
 
 STALL_S: Final = 0.2  # wait for a reader of progress that stands still

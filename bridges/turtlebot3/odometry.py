@@ -6,7 +6,7 @@ Its speed is that of its poses: the twist of turtlebot3_node was zero until Dece
 from __future__ import annotations
 
 from collections import deque
-from math import cos, hypot, inf, isfinite, nan, pi, sin
+from math import cos, hypot, inf, isfinite, nan, sin
 from typing import Final
 
 from agents.body.external_pose import velocity_after
@@ -123,8 +123,7 @@ def _to_arena(frame: Planar, pose: Planar) -> Planar:
     """Transform a pose from `frame` to the arena."""
     x, y, yaw = frame
     c, s = cos(yaw), sin(yaw)
-    heading = pi - (pi - yaw - pose[2]) % (2.0 * pi)
-    return x + c * pose[0] - s * pose[1], y + s * pose[0] + c * pose[1], heading
+    return x + c * pose[0] - s * pose[1], y + s * pose[0] + c * pose[1], wrap(yaw + pose[2])
 
 
 def _frame(arena: Planar, pose: Planar) -> Planar:

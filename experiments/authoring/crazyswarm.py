@@ -19,13 +19,12 @@ from msgspec import Meta, Struct
 
 from agents.body.device_address import DeviceAddress
 from agents.body.interface import BodyError
-from agents.errors import did_you_mean
+from agents.errors import did_you_mean, join_names
 from agents.plugins import registry
 from bridges.crazyflie.protocol import addresses as protocol
 from bridges.crazyflie.protocol.parameters import parameter_faults
 from experiments.authoring.robotic_park.file import MISSING, YamlValue, load, text_of
 from experiments.catalogue import index
-from experiments.check.findings import join_names
 from experiments.definition.experiment import VICON_TWIN, Name
 from experiments.file import catalogue as entries
 from experiments.file import document

@@ -8,6 +8,7 @@ from typing import Final
 
 import numpy as np
 
+from agents.errors import join_names
 from agents.plugins.calls import supervised
 from agents.plugins.files import plain
 from experiments.check import motion, noise, safety, surroundings, theory
@@ -108,9 +109,8 @@ def _findings(given: Document, analyses: Mapping[str, Analysis]) -> list[Finding
     for finding, names in holders.items():
         message = finding.message
         if len(names) < len(analyses):
-            words = ", ".join(f"'{name}'" for name in names[:MOST_NAMED])
-            words += f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
-            message = f"in case{'s' * (len(names) > 1)} {words}: {message}"
+            quoted = join_names([f"'{name}'" for name in names], MOST_NAMED)
+            message = f"in case{'s' * (len(names) > 1)} {quoted}: {message}"
         where = finding.where if isinstance(finding.where, str) else _place(given.source, finding.where, names)
         found.append(replace(finding, message=message, where=where))
     return sorted(found, key=lambda each: list(MARK).index(each.severity))

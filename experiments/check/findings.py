@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Final, Literal
 
@@ -82,12 +82,6 @@ class CheckNumbers(msgspec.Struct, frozen=True, kw_only=True):
     words_bytes: int  # share of these bytes that the law says
     pose_kbit_s: float  # payload of one robot at the largest rate of its trigger [kbit/s]
     predicted_s: float  # share of the run that was predicted
-
-
-def join_names(words: Sequence[str], most: int = 4) -> str:
-    """Words joined by commas; the last of many are counted."""
-    more = len(words) - most
-    return ", ".join(words) if more <= 0 else f"{', '.join(words[:most])} and {more} more"
 
 
 def first_of_each_code(findings: Iterable[Finding]) -> list[Finding]:

@@ -10,12 +10,13 @@ import numpy as np
 
 from agents.body.kinds import Kind
 from agents.decision.position_control import REACHED
+from agents.errors import join_names
 from agents.formation.link import BY_DISTANCE, BY_RELATIVE
 from agents.plugins.planners import Planner
 from agents.safety.hazards import Cause
 from experiments.check import noise
 from experiments.check.analysis import Analysis
-from experiments.check.findings import FORGIVEN, Finding, join_names
+from experiments.check.findings import FORGIVEN, Finding
 from experiments.check.ideal_run import approaches
 from experiments.check.realisation import OFF, mirrored_robots
 from experiments.check.theory import strength

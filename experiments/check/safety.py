@@ -11,11 +11,12 @@ import msgspec
 import numpy as np
 
 from agents.body.kinds import KINDS
+from agents.errors import join_names
 from agents.network.keys import Keys
 from agents.plugins import registry
 from agents.safety.setpoint_filter import OUTSIDE_M
 from experiments.check.analysis import Analysis
-from experiments.check.findings import DEVICE, FORGIVEN, Finding, join_names
+from experiments.check.findings import DEVICE, FORGIVEN, Finding
 from experiments.definition import bodies
 from twins.arrays import norm
 

@@ -8,8 +8,9 @@ from typing import Final
 
 import numpy as np
 
+from agents.errors import join_names
 from experiments.check.analysis import Analysis
-from experiments.check.findings import APART, FORGIVEN, Finding, join_names
+from experiments.check.findings import APART, FORGIVEN, Finding
 from experiments.definition.bodies import sensors_of
 from experiments.definition.experiment import WORLD
 from twins import scene as outlines

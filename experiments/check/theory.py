@@ -11,14 +11,14 @@ import numpy as np
 
 from agents.decision.goals import GoalComputer
 from agents.decision.stepping import Stepping
-from agents.errors import did_you_mean
+from agents.errors import did_you_mean, join_names
 from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_RELATIVE
 from agents.network import messages
 from agents.plugins.calls import unknown_reads
 from agents.plugins.laws import Gradient
 from agents.vectors import ZERO
 from experiments.check.analysis import FAR_OFF, Analysis
-from experiments.check.findings import FORGIVEN, Finding, Severity, join_names
+from experiments.check.findings import FORGIVEN, Finding, Severity
 from experiments.check.realisation import OFF, Conflict, Shape, best_shape, conflicts, contradictions
 from experiments.definition.experiment import Formation
 from experiments.definition.formation import law_offsets, unlinked

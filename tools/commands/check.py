@@ -225,7 +225,7 @@ def _rows(numbers: Mapping[str, CheckNumbers]) -> list[str]:
 
 
 def _formatted(of: CheckNumbers) -> dict[str, str]:
-    from experiments.check.findings import join_names
+    from agents.errors import join_names
 
     def number(value: float | None, form: str, unit: str = "") -> str:
         return "-" if value is None else f"{value:{form}}{unit}"

@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from agents.vectors import Pose, Vector, clamp
+from agents.vectors import Pose, Vector, clamp, wrap
 from bridges.crazyflie.protocol.crtp import LogStatus
 from twins.arrays import Array
 
@@ -212,8 +212,3 @@ class OnboardPlanner:
     @staticmethod
     def _shorter_turn(pose: Array, goal: Array) -> Array:
         return np.array([*goal[:3], pose[3] + wrap(goal[3] - pose[3])])
-
-
-def wrap(angle: float) -> float:
-    """Angle from -pi up to pi [rad]."""
-    return (angle + pi) % (2.0 * pi) - pi

@@ -11,10 +11,11 @@ from typing import Final
 
 import numpy as np
 
+from agents.vectors import wrap
 from bridges.crazyflie.protocol import crtp
 from bridges.crazyflie.protocol.crtp import COMPRESSED, IN_MEMORY, LogStatus, MemoryKind
 from bridges.crazyflie.twin.memory import Memories
-from bridges.crazyflie.twin.planner import ORDER, Piece, evaluate, wrap
+from bridges.crazyflie.twin.planner import ORDER, Piece, evaluate
 from twins.arrays import Array
 
 POINTS: Final = (0, 1, 3, 7)  # control points of a compressed element beside the one that the last piece ends with

@@ -16,12 +16,12 @@ from typing import Any, Final, TypeVar
 import numpy as np
 
 from agents.body.kinds import KINDS
+from agents.errors import join_names
 from experiments.authoring.robotic_park import file as park_files
 from experiments.authoring.robotic_park.file import PLACES, SURFACES, ParkExperiment, ParkRobot, Task
 from experiments.authoring.robotic_park.heights import Heights, find_heights, origin_of
 from experiments.catalogue import index
 from experiments.check.analysis import sampled_loop
-from experiments.check.findings import join_names
 from experiments.check.realisation import targets_of_law
 from experiments.check.theory import OSCILLATING_GAIN, UNSTABLE_GAIN
 from experiments.file import catalogue as entries

@@ -20,7 +20,7 @@ import yaml
 from msgspec import Meta, Struct
 
 from agents.body.kinds import KINDS
-from agents.errors import did_you_mean
+from agents.errors import did_you_mean, join_names
 from experiments.file.problems import DocumentError, Problem, at_offset, refusal
 from experiments.file.text import content
 
@@ -392,8 +392,7 @@ def _counted(file: str, problems: list[Problem]) -> list[Problem]:
     if len(missing) < 2:
         return problems
     names = list(dict.fromkeys(Path(each.file).name for each in missing))
-    shown = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
-    message = f"names {len(names)} file{'s' * (len(names) > 1)} of robots that are not beside it: {shown}"
+    message = f"names {len(names)} file{'s' * (len(names) > 1)} of robots that are not beside it: {join_names(names)}"
     return [*(each for each in problems if each not in missing), Problem(file, 0, 0, message, missing[0].hint)]
 
 
