@@ -62,6 +62,7 @@ COMMANDS = (
     ("check page.html", "page.html: is a page, no experiment", "such as experiment.toml"),
     ("explain disturbance.hover", "'disturbance.hover'", "did you mean 'disturbance.hover_jitter'?"),
     ("new triangle triangle.toml", "triangle.toml: exists already", "choose another name"),
+    ("new mine.toml", "say what mine.toml begins with", "`./zenpark new triangle mine.toml`"),
     ("new --grid 5", "--grid 5: ", "such as 5x8"),
     ("new --grid 1000000x1000000", "robots are more than 5000", "give fewer"),
     ("new triangle nope/x.toml", "nope/x.toml: cannot be written", "choose a place that exists"),

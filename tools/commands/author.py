@@ -63,6 +63,8 @@ def new(
     if not formations:
         if name is None:
             raise typer.BadParameter("give a NAME (`./zenpark list`), or a formation such as --hemisphere 40")
+        if target is None and name.endswith(".toml") and not Path(name).exists():
+            raise typer.BadParameter(f"say what {name} begins with: `./zenpark new triangle {name}`, or --polygon 5")
         path = catalogue.copy_entry(name, Path(target) if target else Path(f"{name}.toml"))
         print(f"{path}: a copy of {name}; change it, then `./zenpark check {path}` and `./zenpark run {path}`")
         return
