@@ -81,7 +81,7 @@ def read(text: str, body: str = "", up: str = "y") -> Curve:
             raise FormatError(f"line {rows[0][0]}: {len(first)} numbers without names above them; {FORMS}")
         return Samples(_samples(rows, dict(zip(("t", "x", "y", "z", *QUATERNION), range(8), strict=True)), {}))
     places, factors = _columns(rows[0], body)
-    return Samples(_samples(rows[1:], places, factors))
+    return Samples(_samples(_lines_of(body, rows), places, factors))
 
 
 def _rows(lines: Sequence[str], body: str) -> Rows:
@@ -111,6 +111,25 @@ def _known(line: str, body: str) -> set[str]:
     """Columns that a line names."""
     found = (_column(name, body) for name in _split(line, _sign(line)))
     return {column.name for column in found if column}
+
+
+def _lines_of(body: str, rows: Rows) -> Rows:
+    """Lines below the names: those of a robot and a case in a table of several, as `./zenpark export --csv` writes."""
+    (number, names), *found = rows
+    for column, wanted, hint in (
+        ("robot", body, 'write body = "{}", or another'),
+        ("case", "", 'keep the lines of "{}", or of another'),
+    ):
+        if column not in names:
+            continue
+        place = names.index(column)
+        values = dict.fromkeys(cells[place] for _, cells in found if place < len(cells))
+        if wanted in values:
+            found = [row for row in found if row[1][place : place + 1] == [wanted]]
+        elif len(values) > 1:
+            listed = ", ".join([*values][:12])
+            raise FormatError(f"line {number}: it has the {column}s {listed}; {hint.format(next(iter(values)))}")
+    return found
 
 
 class _Column(NamedTuple):

@@ -35,6 +35,7 @@ Frame,Time (Seconds),X,Y,Z,W,X,Y,Z,,X,X
 2,0.200000,0,0,0,1,200,300,-200,0.1,1,5
 """
 NAMES = [f"/CF0{n}/pose/position/{axis}" for n in (1, 2) for axis in "xy"]
+RUN = "case,time,robot,x,y,yaw\na,0,R1,0,0,0\na,0,R2,1,0,0\nb,1,R1,1,0,0\nb,1,R2,2,0,0\n"
 TOPICS = f"time,{','.join(NAMES)}\n0,0,1,5,6\n1,1,1,6,6\n"  # as PlotJuggler writes them
 
 
@@ -68,6 +69,7 @@ def content(text):
         (TOPICS, "CF02", {0.5: (5.5, 6, nan, nan)}),
         (TOPICS, "/CF01/pose", {0.5: (0.5, 1, nan, nan)}),
         ("t,x,y,CF01_x,CF01_y\n0,0,0,5,5\n1,0,0,6,6\n", "CF01", {0.5: (5.5, 5.5, nan, nan)}),
+        (RUN.replace("b,1", "a,1"), "R2", {0.5: (1.5, 0, nan, 0)}),
         ("t,x,y\n0,0,0\n1,1,1\n", "CF01", {0.5: (0.5, 0.5, nan, nan)}),
         (VICON, "drone", {0.0: (0.1, 0.2, 0.3, radians(90)), 0.01: (0.11, 0.2, 0.3, radians(90.5))}),
         (MOTIVE, "cf 1", {0.0: (0.1, 0.2, 0.3, radians(90)), 0.1: (0.15, 0.2, 0.3, radians(45))}),
@@ -95,6 +97,8 @@ def test_formats_hold_these_poses(text, body, poses):
         (f"{HEADER}\n1,2,3\n", "line 2: 3 numbers; a piece is a duration and 32"),
         (f"{HEADER}\n{piece(0)}\n", "line 2: the duration 0 s; give a positive one"),
         (f"{HEADER}\n", "no piece"),
+        (RUN, 'line 1: it has the robots R1, R2; write body = "R1", or another'),
+        (RUN.replace("R2", "R1"), 'line 1: it has the cases a, b; keep the lines of "a", or of another'),
         (TOPICS, 'line 1: it has places of CF01_pose, CF02_pose; write body = "CF01_pose", or another'),
         (VICON, 'line 3: it has drone, wand; write body = "drone"'),
         (VICON.replace("100\n", "\n", 1), "no rate stands above"),
