@@ -30,6 +30,7 @@ CREEPS: Final = 0.025  # [m/s] largest speed of a robot that creeps
 STEP: Final = 0.05  # [m]
 STALLS_S: Final = 4.0  # [s] time after which a climb without `STEP` of gained height counts as stalled
 STALLS_OUTSIDE_S: Final = 0.7  # [s] the same of a robot that flies by positions from outside, once it has risen
+GAP_S: Final = 1.0  # [s] time without a tick after which the watch of a climb restarts: its process stood still
 STALLS_VELOCITY_S: Final = 10.0  # [s] the same of a device that takes velocities: it may need a second order
 SINKS: Final = 0.15  # [m/s] downward speed at which the robot does not fly to its goal
 AHEAD_S: Final = 0.1  # no network here is later than this: stamps further ahead come from a clock that is ahead
@@ -64,6 +65,7 @@ class Ascent:
 
     def __init__(self, kind: Kind, hover: float, *, outside: bool) -> None:
         self.climbing = False  # state on the last tick
+        self.last = -inf  # time of that [s]
         self.hover = hover  # height at the end [m]
         self.begin = UNKNOWN  # position at the begin [m]
         self.free = RUSH_S * kind.speed + kind.radius  # distance from there that is no matter [m]
@@ -85,7 +87,8 @@ class Ascent:
         if begins:
             self.begin = position
         height = position[2]
-        stands = begins or not spinning
+        stands = begins or not spinning or t - self.last > GAP_S
+        self.last = t
         if stands or not height <= self.highest + STEP:
             self.highest, self.risen_at = height, t
             self.risen = not stands

@@ -122,6 +122,18 @@ def test_suspended_robot_holds_until_it_hears():
     assert end.startswith("over: ")
 
 
+@pytest.mark.parametrize("since", ["ready", "landing"])
+def test_computer_that_slept_lands_its_robots(since):
+    """Its conductor killed the processes of robots in mid-air: their time to land was over when it went on."""
+    asleep = [Fault(0.5, "pause", name, lasts=30.0, since=since) for name in ("A", "C", "router", "conductor")]
+    flight = fly(DRONE, *asleep)
+    assert flight.code == 2
+    assert "this process stood still for more than 3 s" in flight.output
+    assert flight.robots["C"].motors[-1][1] is False
+    assert [each.code for each in (*flight.of("default-A"), *flight.of("default-C"))] == [0, 0]
+    assert not [text for _, text in flight.robots["C"].hazards if "it does not rise" in text]
+
+
 def test_second_process_ends_without_a_command():
     flight = fly(TRIO, Fault(AT_S, "twice", "A"), settings=["duration_s=5"])
     (second,) = flight.of("second A")

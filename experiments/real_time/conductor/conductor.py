@@ -350,6 +350,7 @@ class Conductor(CaseRun):
         self._view.report("phase", "conductor", "landing" + (f" ({how})" if how else ""))
         deadline, repeat_at = time.monotonic() + LAND_S, -inf
         while True:
+            self._update()  # raises before robots count as late that stood still with this process
             if time.monotonic() >= repeat_at:  # a busy machine may have lost the order
                 up = [name for name, view in self._robots.items() if not view.reached("landing")]
                 self._order(messages.Order("land"), up)
@@ -357,7 +358,6 @@ class Conductor(CaseRun):
             late = self._not_down()
             if not late or time.monotonic() >= deadline:
                 break
-            self._update()
             time.sleep(POLL_S)
         for name in late:
             self._leave_behind(name, f"did not end its landing within {LAND_S:g} s: {self._reason(name)}")

@@ -11,7 +11,7 @@ from typing import Final, Literal
 
 import zenoh
 
-from agents.clock import Clock, wait_until
+from agents.clock import Clock, uptime, wait_until
 from agents.decision.lifecycle import FINISHED, SCRIPTED, TOLD_TO_END, Phase
 from agents.errors import ExplainedError
 from agents.network import endpoints as topology
@@ -148,7 +148,7 @@ class NetworkView:
         """Join the network; `stack` leaves it."""
         self.clock, self.robots = progress.clock, progress.robots
         self._progress = progress
-        self._launcher, self._begun = context.launcher, time.monotonic()
+        self._launcher, self._begun = context.launcher, uptime()
         experiment, endpoints = context.plan.experiment, context.endpoints
         self._keys = keys = Keys(experiment.network.realm)
         identity, rights = context.identity, mesh.member_rights(context.plan, endpoints)

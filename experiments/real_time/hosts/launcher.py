@@ -25,7 +25,7 @@ from math import inf
 from pathlib import Path
 from typing import IO, Final, Self
 
-from agents.clock import Clock
+from agents.clock import Clock, uptime
 from agents.errors import ExplainedError
 from agents.network import messages
 from agents.network.endpoints import from_here
@@ -39,6 +39,7 @@ ZYGOTE: Final = "zygote"
 LAND_S: Final = 15.0  # time for robots to come down after their lifeline was cut
 LINGER_S: Final = 15.0  # the router outlives a killed conductor, so that the landing is recorded
 READY_S: Final = 15.0  # limit for a process to say that it is ready
+TURN_S: Final = 0.2  # time for which an end is awaited at once
 STOP_PATIENCE_S: Final = 0.1  # patience for the lock of the list of processes
 TAIL: Final = 12  # lines of a dead process's output that are worth showing
 
@@ -155,13 +156,13 @@ class Launcher:
         self._zygote: Path | None = None  # its socket; None if there is none, or none any more
         self._lock = threading.Lock()
         self._over = threading.Event()
-        self._silence_at, self._beat_at = -inf, time.monotonic()
+        self._silence_at, self._beat_at = -inf, uptime()
         self._line = b"\n"  # line of each heartbeat
         self._beat = threading.Thread(target=self._beats, name="heartbeat", daemon=True)
 
     def __enter__(self) -> Self:
         self._logs.mkdir(parents=True, exist_ok=True)
-        self._beat_at = time.monotonic()
+        self._beat_at = uptime()
         self._beat.start()
         return self
 
@@ -329,20 +330,27 @@ class Launcher:
 
     @staticmethod
     def _wait(processes: Sequence[Process], limit_s: float) -> None:
-        deadline = time.monotonic() + limit_s
+        """Wait for the ends of processes; a suspension of this one, with which they may have stood, is one turn."""
+        left_s = limit_s
         for process in processes:
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                process.handle.wait(max(0.0, deadline - time.monotonic()))
+            while left_s > 0.0 and process.alive:
+                begun = time.monotonic()
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.handle.wait(min(TURN_S, left_s))
+                left_s = round(left_s - min(time.monotonic() - begun, TURN_S), 6)
 
     @property
     def last_silence(self) -> float:
-        """Time of the last silence of the heartbeat that made all processes land and end [monotonic s]; -inf: none."""
-        now = time.monotonic()
+        """Time of the last silence of the heartbeat that made all processes land and end [s, `uptime`]; -inf: none.
+
+        A machine that sleeps is silent, too.
+        """
+        now = uptime()
         return now if now - self._beat_at > SILENCE_S + BEAT_S else self._silence_at
 
     def _beats(self) -> None:
         while not self._over.wait(BEAT_S):
-            self._silence_at, self._beat_at = self.last_silence, time.monotonic()
+            self._silence_at, self._beat_at = self.last_silence, uptime()
             with self._lock:
                 for process in self._processes.values():
                     line = self._line if process.handle.stdout is None else b"\n"

@@ -4,7 +4,6 @@ import math
 import re
 import socket
 import threading
-import time
 from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,7 +11,7 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from agents.clock import Clock
+from agents.clock import Clock, uptime
 from agents.network import messages
 from agents.network.endpoints import Endpoint, free_endpoint
 from agents.network.keys import Keys
@@ -467,10 +466,10 @@ def test_router_with_port_taken_meanwhile_listens_elsewhere(tmp_path, monkeypatc
 
 
 def test_suspended_launcher_knows_when_its_robots_have_landed(tmp_path, monkeypatch):
-    launcher, zero = Launcher(tmp_path), time.monotonic()
+    launcher, zero = Launcher(tmp_path), uptime()
     for since, silence in ((3.0, -math.inf), (3.7, zero + 3.7), (40.0, zero + 40.0)):
         with monkeypatch.context() as patched:
-            patched.setattr(time, "monotonic", lambda at=zero + since: at)
+            patched.setattr("experiments.real_time.hosts.launcher.uptime", lambda at=zero + since: at)
             assert launcher.last_silence == silence
 
 
