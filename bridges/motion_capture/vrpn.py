@@ -1,6 +1,6 @@
 """CaptureReader of VRPN by the library `motioncapture`, in a process of its own, which may hang or be killed.
 
-The library tells poses by name alone: no latency, no frame number, no upward axis, and a hidden body keeps its pose.
+The library tells poses by name alone: no latency, no frame number, no upward axis; hidden bodies are left out.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ class VrpnReader(CaptureReader):
 
     PORT: ClassVar = 3883
     PROGRAM: ClassVar = "the VRPN server"
-    SYSTEM: ClassVar = "vrpn"  # name in the library
 
     def __init__(self, host: str, port: int = 3883, timeout_s: float = 2.0) -> None:
         if importlib.util.find_spec("motioncapture") is None:
             raise MissingVrpnError(NEEDED)
         self._number, self._rest = 0, b""
+        self._names = set[str]()  # bodies that were seen: hidden ones are left out
         read, write = os.pipe()
         os.set_blocking(read, False)
-        command = [sys.executable, "-m", "bridges.motion_capture.vrpn", self.SYSTEM, f"{host}:{port}", str(write)]
+        command = [sys.executable, "-m", "bridges.motion_capture.vrpn", f"{host}:{port}", str(write)]
         silent = subprocess.DEVNULL
         self._frames: BinaryIO = os.fdopen(read, "rb", buffering=0)
         try:
@@ -61,8 +61,10 @@ class VrpnReader(CaptureReader):
         if poses is None:
             return None
         self._number += 1
+        hidden = dict.fromkeys(self._names - poses.keys())
+        self._names |= poses.keys()
         seen = {name: MeasuredPose((x, y, z), rotation_of(turn)) for name, (x, y, z, *turn) in poses.items()}
-        return CaptureFrame(self._number, seen)
+        return CaptureFrame(self._number, hidden | seen)
 
     def close(self) -> None:
         self._child.kill()
@@ -85,11 +87,11 @@ class VrpnReader(CaptureReader):
             time.sleep(0.002)
 
 
-def tell(system: str, server: str, pipe: BinaryIO) -> None:
-    """Write the frames of a system to a pipe, without end."""
+def tell(server: str, pipe: BinaryIO) -> None:
+    """Write the frames of a server to a pipe, without end."""
     import motioncapture  # noqa: PLC0415 - in the child alone
 
-    capture = motioncapture.connect(system, {"hostname": server})
+    capture = motioncapture.connect("vrpn", {"hostname": server})
     while True:
         capture.waitForNextFrame()
         poses = {
@@ -103,4 +105,4 @@ def tell(system: str, server: str, pipe: BinaryIO) -> None:
 if __name__ == "__main__":
     if sys.platform == "linux":  # a library that hangs does not notice the end of its parent
         ctypes.CDLL(None).prctl(WITH_PARENT, signal.SIGKILL)
-    tell(sys.argv[1], sys.argv[2], os.fdopen(int(sys.argv[3]), "wb", buffering=0))
+    tell(sys.argv[1], os.fdopen(int(sys.argv[2]), "wb", buffering=0))
