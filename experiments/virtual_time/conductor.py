@@ -12,7 +12,6 @@ from agents.robot import Robot
 
 LEAD_S: Final = 0.5  # time from the order to the common start
 ORDERS_S: Final = 0.5  # orders before the start fall on multiples of this, as those of a conductor do
-SOON_S: Final = 5.0  # a climb or a landing that has not ended is looked at again
 PATIENCE_S: Final = 60.0  # limit for robots to be ready, up or down: after it they never will be
 
 
@@ -37,13 +36,13 @@ class VirtualConductor:
     def next_order(self, tick: int, dt: float) -> int:
         """Tick after which an order may be due or phases end by the clock; asked before `tick`, of `dt` [s].
 
-        For as long as no phase changes. When a climb or a landing ends is not known: it is asked for again soon.
+        For as long as no phase changes.
         """
         if self._stage == Phase.RUNNING:
             ends = (self.start_at, self.start_at + self._robots[0].assignment.duration)
             return next((last for last in (round(end / dt) for end in ends) if last > tick), tick)
         if min([robot.lifecycle.phase for robot in self._robots]) < self._stage:
-            return min(round((self._since + self._patience_s) / dt), tick + round(SOON_S / dt))
+            return max(tick, round((self._since + self._patience_s) / dt))
         every = max(1, round(ORDERS_S / dt))
         return -(-tick // every) * every
 

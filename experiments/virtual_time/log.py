@@ -39,8 +39,6 @@ from experiments.virtual_time.simulation import VirtualRunLog
 from twins.arrays import Array, Index
 
 SAMPLED: Final = ("position", "yaw", "true_position", "goal", "setpoint")  # columns of a log that a trace has as well
-
-
 MANY_ROWS: Final = 10_000
 LARGE_CHUNK_BYTES: Final = 512 * 1024  # size for a run that is over: there is nothing to be lost by a kill
 

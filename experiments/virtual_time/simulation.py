@@ -176,7 +176,6 @@ class VirtualRun:
         self._duration = plan.experiment.duration_s - 0.5 * self.dt  # [s] robots that land later are not lost
         self._tick = 0
         self.stretches: Stretches | None = None  # compiled ones, where they pay
-        self._samples: list[dict[str, Any]] = []
         self._columns: dict[str, list[Array]] = {}
         self.touches: list[Touch] = []  # contacts that began so far
         self._memory, self._measures = LawColumns(), LawColumns()
@@ -212,7 +211,8 @@ class VirtualRun:
                 self._sample(t)
             if not landing and t - conductor.start_at >= self.plan.experiment.duration_s - 0.5 * dt:
                 return
-            self._end_tick()
+            self._give_orders()
+            self._tick += 1
 
     def _fly_stretch(self, end: int = sys.maxsize) -> bool:
         """Fly a compiled stretch, where one pays now, from between the halves of this tick to those of another.
@@ -264,7 +264,8 @@ class VirtualRun:
     def decide(self, t: float) -> None:
         """Second half of the tick at `t` [s]: goals, setpoints and commands, then the orders of the conductor."""
         self._act(t)
-        self._end_tick()
+        self._give_orders()
+        self._tick += 1
 
     def fly_ticks(self, count: int, *, everything: bool = True) -> None:
         """Fly `count` ticks from between the halves of this one, compiled where that pays.
@@ -306,10 +307,6 @@ class VirtualRun:
     def start_at(self) -> float:
         """Common start [s], NaN before it is known."""
         return self._conductor.start_at
-
-    def _end_tick(self) -> None:
-        self._give_orders()
-        self._tick += 1
 
     def _receive(self, t: float) -> None:
         self._states = self._body.read(t)
@@ -371,11 +368,11 @@ class VirtualRun:
             for what in ("goal", "setpoint", "error"):
                 sample[what] = [getattr(robot, what) for robot in self.robots]
             sample["obstacles"] = [tuple(each) for each in self.twin.engine.obstacles]
-        self._samples.append(sample)
+        for what, value in sample.items():
+            self._columns.setdefault(what, []).append(np.array([value]))
 
     def note(self, ledger: Ledger, steps: Steps) -> None:
         """Note the samples of a compiled stretch."""
-        self._settle()
         count, rows = ledger.sample, len(self.robots)
         columns = self._columns
         columns.setdefault("time", []).append(np.array(ledger.times[:count]))
@@ -398,16 +395,8 @@ class VirtualRun:
             values = np.array([getattr(robot.now.state, what) for robot in self.robots])
             columns.setdefault(what, []).append(np.repeat(values[None], count, axis=0))
 
-    def _settle(self) -> None:
-        """Turn samples into columns."""
-        if self._samples:
-            for what in self._samples[0]:
-                self._columns.setdefault(what, []).append(np.array([sample[what] for sample in self._samples]))
-            self._samples = []
-
     def log(self) -> VirtualRunLog:
         """Everything recorded so far."""
-        self._settle()
         conductor, names = self._conductor, self.names
         begin, time = conductor.start_at, np.concatenate(self._columns["time"])
         columns: dict[str, Any] = {}
@@ -450,35 +439,25 @@ class LawColumns:
 
     def __init__(self) -> None:
         self._parts: list[tuple[int, dict[str, Array]]] = []  # numbers of samples, each with their columns
-        self._last: list[Sequence[Mapping[str, Any]]] = []
 
     def add(self, sample: Sequence[Mapping[str, Any]]) -> None:
         """Add a sample, by robot."""
-        self._last.append(sample)
+        known = dict(chain.from_iterable(row.items() for row in sample))
+        blank = {name: np.full_like(value, np.nan, dtype=float) for name, value in known.items()}
+        columns = {
+            name: np.array([[row.get(name, none) for row in sample]], dtype=float) for name, none in blank.items()
+        }
+        self._parts.append((1, columns))
 
     def extend(self, count: int, columns: dict[str, Array]) -> None:
         """Add columns over `count` samples."""
-        self._settle()
         if count:
             self._parts.append((count, columns))
 
     def columns(self) -> dict[str, Array]:
         """(K, N) of numbers, (K, N, k) of tuples; NaN where a robot has no such value."""
-        self._settle()
         blank = {name: np.full_like(column[0], np.nan) for _, part in self._parts for name, column in part.items()}
         return {
             name: np.concatenate([part.get(name, np.repeat(none[None], k, axis=0)) for k, part in self._parts])
             for name, none in blank.items()
         }
-
-    def _settle(self) -> None:
-        if self._last:
-            blank: dict[str, Array] = {}
-            for row in chain.from_iterable(self._last):
-                blank |= {name: np.full_like(row[name], np.nan, dtype=float) for name in row if name not in blank}
-            columns = {
-                name: np.array([[row.get(name, none) for row in rows] for rows in self._last], dtype=float)
-                for name, none in blank.items()
-            }
-            self._parts.append((len(self._last), columns))
-            self._last = []

@@ -128,14 +128,11 @@ def expect(seconds: float) -> None:
 
 def possible(flight: Flown) -> bool:
     """Whether the robots of a flight can be flown by compiled functions, unless a plug-in is outside of the subset."""
-    says = [robot.stepping.says for robot in flight.robots if robot.stepping is not None]
-    if not flight.compiles or not machine.works() or any(each != flight.network.says for each in says):
-        return False
-    if says and flight.twin.together:  # laws may read scans
-        return False
-    if not all(values for robot in flight.robots if robot.stepping for values in robot.stepping.memory.values()):
-        return False
-    return all(robot.guidance is None for robot in flight.robots)
+    stepping = [robot.stepping for robot in flight.robots if robot.stepping is not None]
+    fits = all(each.says == flight.network.says and all(each.memory.values()) for each in stepping)
+    scans = bool(stepping) and flight.twin.together  # laws may read scans
+    guided = any(robot.guidance is not None for robot in flight.robots)
+    return flight.compiles and fits and not (scans or guided) and machine.works()
 
 
 class TornError(Exception):
