@@ -70,6 +70,7 @@ class _Enabled(Struct, frozen=True):
 class _Capture(Struct, frozen=True):
     enabled: bool = True
     marker: str = ""
+    tracking: str = ""  # "vendor": by the system's own software; else by that of Crazyswarm
 
 
 class _Type(Struct, frozen=True):
@@ -316,6 +317,12 @@ def _notes(root: YamlValue, drones: Sequence[SwarmDrone]) -> Iterator[str]:
         yield f"{join_names(high, 12)}: the height of initial_position; drones start on the floor, and their yaw is 0"
     if single := [each.name for each in drones if each.capture.enabled and "single_marker" in each.capture.marker]:
         yield f"{join_names(single, 12)}: a single marker; here motion capture must know each drone as a rigid body"
+    followed = [each for each in drones if each.capture.enabled and each.capture.tracking != "vendor"]
+    if several := [each.name for each in followed if "single_marker" not in each.capture.marker]:
+        yield (
+            f"{join_names(several, 12)}: Crazyswarm tells drones with equal markers apart by where they start; here "
+            "motion capture does, by its own rigid bodies: give each drone its name there, and markers of its own"
+        )
     others = dict.fromkeys(key for _, entry in _listed(root) for key in entry.value if key not in TAKEN)
     unread = [key for key in (*_keys(root.value.get("all")), *others) if key != "firmware_params"]
     if unread:

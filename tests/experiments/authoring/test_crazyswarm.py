@@ -65,10 +65,19 @@ def test_enabled_drones_fly_by_their_radios():
     assert robots["cf1"].device == {"parameters": {"stabilizer.controller": 2, "kalman.pNAcc_xy": 1.0}}
     assert "posCtlPid.xKp = 90 is far from the firmware's own 2; choose 0.5 to 8" in notes
     assert "pm.lowVoltage is a protection of the drone" in notes
+    assert "cf1, cf3: Crazyswarm tells drones with equal markers apart" in notes
     found, _ = examine(read)
     assert {each.severity for each in found} == {"note"}  # none says that something is not compiled
     log = fly(read.experiment).log
     assert log.true_position[:, :, 2].max(axis=0) == pytest.approx([0.63, 0.63], abs=0.06)
+
+
+@pytest.mark.parametrize(("tracking", "said"), [("vendor", False), ("librigidbodytracker", True)])
+def test_equal_markers_need_rigid_bodies_of_a_name(tracking, said):
+    text = swarm(drone(1)).replace("enabled: false, marker", f'tracking: "{tracking}", marker')
+    read, notes = converted(text)
+    assert read.experiment.robots["cf1"].position == "external"
+    assert ("equal markers" in notes) == said
 
 
 def test_motion_capture_is_that_of_the_file_beside(tmp_path):
