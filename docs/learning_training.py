@@ -27,24 +27,25 @@ CASES = ("periodic", "event", "event-loss", "poor")
 HARD = CASES[2:]  # cases in which it learns
 NEIGHBOURS, SCALES = 3, 3
 FASTEST = 0.6  # [m/s]
-# logarithms of three scales [1/m], their weights [m/s], factor of the own velocity: a cautious beginning
+# logarithms of three scales [1/m], their gains for small errors [1/s], factor of the own velocity: a cautious beginning
 FIRST = np.array([0.0, 1.5, 3.0, 0.2, 0.0, 0.0, 0.0])
 # logarithm of a threshold [m], weight of the time since the last event [cm/s], and of the error [1/100]
 FIRST_TRIGGER = np.array([-4.0, 0.0, 0.0])
 SPREAD = 0.2  # first deviation of these numbers
 GENERATIONS, CANDIDATES = 16, 10  # of a policy; a trigger has half of these generations
+REST = 40.0  # weight of the mean error over the last ten decisions: they count five times
 PRICE = 0.1  # error of a robot over one decision that is worth a message [m]
 
 
 def layers(numbers: Array) -> tuple[Array, Array, Array]:
     """Weights of the policy: observation (16,) → hidden (18,), hidden → velocity (2,), observation → velocity."""
-    scales, weights, brake = np.exp(numbers[:SCALES]), numbers[SCALES : 2 * SCALES], numbers[-1]
+    scales, gains, brake = np.exp(numbers[:SCALES]), numbers[SCALES : 2 * SCALES], numbers[-1]
     hidden, output = np.zeros((4 + 4 * NEIGHBOURS, 2 * SCALES * NEIGHBOURS)), np.zeros((2 * SCALES * NEIGHBOURS, 2))
     for unit in range(2 * SCALES * NEIGHBOURS):
         neighbour, scale, axis = unit // (2 * SCALES), unit // 2 % SCALES, unit % 2
         place = 4 + 4 * neighbour + axis  # where the neighbour is; two behind it, where it should be
         hidden[place, unit], hidden[place + 2, unit] = scales[scale], -scales[scale]
-        output[unit, axis] = weights[scale]
+        output[unit, axis] = gains[scale] / scales[scale]
     direct = np.zeros((4 + 4 * NEIGHBOURS, 2))
     direct[2, 0] = direct[3, 1] = brake
     return hidden, output, direct
@@ -71,27 +72,27 @@ def fly(policy: Callable[[Array], Array], case: str, seed: int, trigger: str = "
     """
     many = environment(case, trigger)
     observations, _ = many.reset(seed=seed)
-    rewards, messages = [], 0
+    errors, messages = [], 0
     while many.agents == many.possible_agents:  # to the end, or to the first contact
         actions = policy(np.array([*observations.values()]))
         observations, reward, *_, infos = many.step(dict(zip(observations, actions, strict=True)))
-        messages += sum(info["messages"] for info in infos.values())
-        rewards.append(sum(reward.values()) / len(many.possible_agents))
-    sent = PRICE * messages / len(many.possible_agents)
-    return sum(rewards) + sent, -float(np.mean(rewards[-10:])), messages
+        sent = sum(info["messages"] for info in infos.values())
+        messages += sent
+        errors.append(-(sum(reward.values()) + PRICE * sent) / len(many.possible_agents))
+    return -sum(errors), float(np.mean(errors[-10:])), messages
 
 
 def fitness(job: tuple[Array, int]) -> float:
-    """Mean return of a policy over the hard cases, less the price of its messages."""
+    """Mean return of a policy over the hard cases, less the weight of its rest and the price of its messages."""
     found = [fly(policy_of(job[0]), case, job[1]) for case in HARD]
-    return float(np.mean([total - PRICE * messages / 4 for total, _, messages in found]))
+    return float(np.mean([total - REST * rest - PRICE * messages / 4 for total, rest, messages in found]))
 
 
 def fitness_of_trigger(job: tuple[Array, Array, int]) -> float:
     """The same of a trigger with a policy, in the case with losses."""
     trigger, numbers, seed = job
-    total, _, messages = fly(policy_of(numbers), "event-loss", seed, b64encode(trigger_model(trigger)).decode())
-    return total - PRICE * messages / 4
+    total, rest, messages = fly(policy_of(numbers), "event-loss", seed, b64encode(trigger_model(trigger)).decode())
+    return total - REST * rest - PRICE * messages / 4
 
 
 def evolve(
