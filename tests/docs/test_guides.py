@@ -88,7 +88,8 @@ def test_a_guide_flies_in_real_time(command, tmp_path, monkeypatch):
     (text,) = [step.text for step in found if (step.kind, step.file) == ("toml", name)]
     file, out = tmp_path / name, tmp_path / "runs" / Path(name).stem
     file.write_text(text, "utf-8")
-    zenpark("run", file, *options, "--no-report", "--out", out, timeout_s=120.0)
+    done = zenpark("run", file, *options, "--no-report", "--out", out, timeout_s=120.0, code=None)
+    assert done.returncode in {0, 3}, done.stdout  # 3: a busy machine has missed deadlines
     monkeypatch.chdir(tmp_path)
     for step in found:
         if step.kind == "python" and f'reopen("runs/{out.name}")' in step.text:
