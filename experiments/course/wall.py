@@ -47,7 +47,9 @@ REFUSED: Final = (
     (101, 117), (310, 270), (311, 271), (438, 438),  # ptrace, process_vm_readv and _writev, pidfd_getfd
     (29, 194), (68, 186), (64, 190), (240, 180), (319, 279), (73, 32),  # shmget, msgget, semget, mq_open, memfd, flock
     (90, -1), (91, 52), (268, 53), (452, 452), (92, -1), (93, 55), (94, -1), (260, 54),  # chmod, chown
-    (132, -1), (235, -1), (261, -1), (280, 88), (188, 5), (189, 6), (190, 7), (197, 14), (198, 15), (199, 16),  # times
+    (76, 45),  # truncate, of which Landlock knows from its version 3 on
+    (132, -1), (235, -1), (261, -1), (280, 88),  # times of files
+    (188, 5), (189, 6), (190, 7), (197, 14), (198, 15), (199, 16),  # attributes of files
 )  # fmt: skip
 
 
@@ -56,7 +58,7 @@ def lacking() -> list[str]:
     found = []
     if _version() < 1:
         found.append("files (Landlock)")
-    if platform.machine() not in AUDIT or not sys.platform.startswith("linux") or _prctl(GET_SECCOMP) != 0:
+    if platform.machine() not in AUDIT or not sys.platform.startswith("linux") or _prctl(GET_SECCOMP) < 0:
         found.append("processes and the network (seccomp)")
     return found
 

@@ -15,7 +15,7 @@ from experiments.course.stand_ins import company
 from experiments.course.wall import lacking
 from experiments.file.document import load
 from experiments.run import simulate
-from tests.commands import GUARD, environment, invoke, started, zenpark
+from tests.commands import GUARD, environment, invoke, python, started, zenpark
 from tests.waiting import until
 
 FILE = """
@@ -178,6 +178,17 @@ def test_a_wall_stands_around_laws(course, tmp_path):
     assert {file.name for file in course.iterdir()} == {"meet.toml", "meet.py", "places.py"}
     assert all(file.stat().st_mode & 0o777 == 0o644 and file.stat().st_size > 0 for file in course.iterdir())
     assert "could" not in said
+
+
+@walled
+def test_a_wall_stands_within_another():
+    """A container has a filter of its own, which is no reason to do without."""
+    wall = "wall_in(20, 1 << 30, []); print(lacking(), flush=True)"
+    done = python(
+        "-c", f"from experiments.course.wall import lacking, wall_in; {wall}; {wall}; open('/etc/passwd')", code=1
+    )
+    assert done.stdout.splitlines() == ["[]", "[]"]
+    assert "PermissionError" in done.stderr
 
 
 @pytest.mark.slow
