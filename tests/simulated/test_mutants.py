@@ -55,6 +55,25 @@ MUTANTS = {
         LOOP, "        if self._opened:\n            self._body.stop", "        if False:\n            self._body.stop",
         test_safety.test_emergency_stop_ends_the_run,
     ),
+    "one round of claims": (
+        OWNERSHIP, "if others := rivals(owners=False):", "if False:",
+        test_safety.test_two_processes_that_claim_a_name_at_once,
+    ),
+    "stopped body is driven on": (
+        LOOP, "robot.lifecycle.stop(stop.words)", "pass", test_safety.test_emergency_stop_ends_the_run,
+    ),
+    "hold ended by the common start": (
+        "agents/robot.py", "if not (airborne and self._ordered):", "if True:",
+        test_safety.test_robot_that_was_ordered_to_hold_holds,
+    ),
+    "body that cannot be read falls": (
+        DESCENT, "            self._order_down(self._body.land, self.limit_s)\n", "            pass\n",
+        test_safety.test_body_that_cannot_be_read_is_landed,
+    ),
+    "landing with token and poses": (
+        LOOP, "if down and (unasked or row in self._orders.leaving) and row not in self._retired:", "if False:",
+        test_safety.test_landing_by_a_hazard_is_lost_at_once,
+    ),
     "silent router unseen": (
         "agents/network/session.py", "> ANSWER_S and self._silent_since", "> 99.0 and self._silent_since",
         partial(row, "cut_shortly"),

@@ -143,6 +143,16 @@ def test_second_process_ends_without_a_command():
     assert (flight.code, flight.robots["A"].hazards) == (0, [])
 
 
+def test_two_processes_that_claim_a_name_at_once():
+    """The later one began a hundred seconds earlier, by its clock."""
+    both = Fault(1.0, "twice", "C", 0.0), Fault(1.0018, "twice", "C", -100.0)
+    flight = fly(TRIO, Fault(0.5, "kill", "C"), *both, settings=["duration_s=4"])
+    robot, seconds = flight.robots["C"], flight.of("second C")
+    drivers = {pid for t, pid in (*robot.poses, *robot.commands) if t > 1.0}
+    assert drivers == {each.pid for each in seconds if each.code != 2}
+    assert (len(drivers), flight.violations) == (1, [])
+
+
 def test_second_process_takes_a_free_name():
     """Others know that the name is alive, though the process that the run has started is not."""
     twice, kill = Fault(0.4, "twice", "C", since="launch"), Fault(0.3, "kill", "C", since="ready")
@@ -217,6 +227,23 @@ def test_hanging_loop_is_landed_then_cut():
     assert flight.robots["C"].off(after=process.ended) == process.ended
 
 
+def test_body_that_cannot_be_read_is_landed():
+    flight = fly(DRONE, Fault(AT_S, "body", "C", "error"))
+    off = flight.robots["C"].off(after=AT_S)
+    assert AT_S + 1.0 < off < AT_S + 2.5
+    assert flight.robots["C"].at(off - 0.1).position[2] < 0.1
+    assert flight.happened("robot", "C", "landing: its control loop broke: OSError")
+    assert (flight.code, flight.violations) == (1, [])
+
+
+def test_landing_by_a_hazard_is_lost_at_once():
+    flight = fly(DRONE, Fault(AT_S, "body", "C", ("battery", 0.05)))
+    lands = flight.robots["C"].entered("landing")[0]
+    assert not [t for t, _ in flight.robots["C"].poses if lands + TICK_S < t < 3.0]
+    assert lands < next(t for t, missing in flight.robots["A"].missing if t > 0.0 and missing == ("C",)) < lands + 0.15
+    assert (flight.code, flight.violations) == (1, [])
+
+
 def test_lost_order_to_land_is_repeated():
     end, lost = 3.0, 5.3
     flight = fly(DRONE, Fault(end - 0.5, "body", "C", "aloft", lost - end + 0.5))
@@ -241,6 +268,7 @@ CASES = '\n[cases]\nfirst.trigger = "periodic"\nsecond.trigger = "periodic"\n'
 def test_emergency_stop_ends_the_run():
     flight = fly(DRONE + CASES, Fault(AT_S, "estop"))
     assert flight.robots["C"].off(after=AT_S) < AT_S + 0.005, "in the receiving thread, before the next tick"
+    assert flight.robots["C"].phases[-1].reason.startswith("emergency stop")
     assert flight.code == 1
     assert "zenpark: emergency stop by operator: zenpark estop" in flight.output
     assert not [each for each in flight.processes if each.name.startswith("second-")]
@@ -278,8 +306,8 @@ def test_stop_that_no_body_confirms_is_told():
 
 def test_robot_that_was_ordered_to_hold_holds():
     flight = fly(
-        DRONE, Fault(-0.3, "order", "A", "hold"), Fault(AT_S, "order", "C", "hold"), Fault(2.0, "order", "A", "start"),
-        Fault(2.5, "order", "C", "resume"), settings=["duration_s=4"],
+        DRONE, Fault(0.5, "order", "A", "hold", since="ready"), Fault(AT_S, "order", "C", "hold"),
+        Fault(2.0, "order", "A", "start"), Fault(2.5, "order", "C", "resume"), settings=["duration_s=4"],
     )  # fmt: skip
     (held, _), (over, _) = flight.robots["A"].hazards
     assert held < 0.1, "the common start ends no hold"
