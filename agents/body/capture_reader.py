@@ -46,6 +46,7 @@ class CaptureReader(ABC):
     PORT: ClassVar[int]  # usual port of the server
     FILE: ClassVar[bool] = False  # the address is the name of a file beside the experiment, not a host
     UP: ClassVar[str] = "z"  # axis that points up where neither the stream nor the file says so
+    METRES: ClassVar[bool] = False  # its poses are in metres, so that the file names no unit
     PROGRAM: ClassVar[str] = "motion capture"  # program that is to run on the host, for messages
     TRANSPORT: ClassVar[str] = "TCP"  # protocol that a firewall must let in, for messages
     HINT: ClassVar[str] = (  # remedy where nothing answers

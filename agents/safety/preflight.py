@@ -126,16 +126,15 @@ class Preflight:
             return
         x, y, _ = now.position  # NaN without a position, which has failed already
         away = hypot(x - start[0], y - start[1])
+        if 2.0 * away >= self._nearest_start:  # else nearer to its own than to any: none of a thousand need be asked
+            places = [(hypot(x - other_x, y - other_y), name) for name, other_x, other_y, _ in self._other_starts]
+            if places and min(places)[0] < away:
+                yield f"it stands where {min(places)[1]} begins: addresses or markers are swapped"
         if away > limit:
             yield f"it is {away:.2f} m from its start ({start[0]:g}, {start[1]:g}), more than {limit:g} m"
         turned = remainder(now.yaw - self._assignment.start_yaw, tau)
         if abs(turned) > TURNED:
             yield f"it is turned by {degrees(turned):.0f}° from the yaw of its `start`: turn it, or {FRAME}"
-        if 2.0 * away < self._nearest_start:  # nearer to its own than to any: none of a thousand need be asked
-            return
-        places = [(hypot(x - other_x, y - other_y), name) for name, other_x, other_y, _ in self._other_starts]
-        if places and min(places)[0] < away:
-            yield f"it stands where {min(places)[1]} begins: addresses or markers are swapped"
 
     def _at_rest(self, now: Situation, state: BodyState) -> Iterator[str]:
         """Drones on the floor, at rest and level; charge of all."""

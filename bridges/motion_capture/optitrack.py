@@ -28,6 +28,7 @@ class OptiTrackReader(CaptureReader):
 
     PORT: ClassVar = natnet.COMMAND_PORT
     UP: ClassVar = "y"
+    METRES: ClassVar = True
     PROGRAM: ClassVar = "Motive with its streaming switched on"
     TRANSPORT: ClassVar = "UDP"
     TWIN: ClassVar = "bridges.motion_capture.twin.optitrack:OptiTrackTwin"

@@ -20,6 +20,7 @@ class QualisysReader(PacketReader):
     """Connection to the real-time server of QTM."""
 
     PORT: ClassVar = qtm.PORT
+    METRES: ClassVar = True
     PROGRAM: ClassVar = "QTM, with its real-time output on"
     TWIN: ClassVar = "bridges.motion_capture.twin.qualisys:QualisysTwin"
 

@@ -63,6 +63,7 @@ class ViconReader(PacketReader):
     """Connection to a DataStream server, that of Tracker or Nexus."""
 
     PORT: ClassVar = vicon_datastream.PORT
+    METRES: ClassVar = True
     PROGRAM: ClassVar = "Tracker or Nexus"
     TWIN: ClassVar = "bridges.motion_capture.twin.vicon:ViconTwin"
 

@@ -39,6 +39,7 @@ class CamerasReader(CaptureReader):
 
     PORT: ClassVar = 0
     FILE: ClassVar = True
+    METRES: ClassVar = True
     HINT: ClassVar = "Does each camera of that file show images, in a browser or in a viewer of webcams?"
     TWIN: ClassVar = "bridges.motion_capture.twin.cameras:CamerasTwin"
 

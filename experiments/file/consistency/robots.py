@@ -78,6 +78,9 @@ def positioning_faults(experiment: Experiment) -> Iterator[Fault]:
         except ValueError as error:
             example = f"{capture.system}.toml" if readers[capture.system].FILE else "192.168.10.1"
             yield Fault(("positioning", *table), str(error), f"such as {capture.scheme}://{example}")
+    if capture.unit != "m" and capture.system in readers and readers[capture.system].METRES:
+        hint = "leave `unit` out, whatever its windows show"
+        yield Fault(("positioning", "unit"), f"positions of {capture.system} arrive in metres", hint)
     measured = [name for name, robot in experiment.robots.items() if robot.position == "external"]
     for name in capture.names:
         if name not in measured:
