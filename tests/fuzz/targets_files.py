@@ -185,6 +185,9 @@ def trajectories():
     """Plans from files: each can be asked for any time."""
     examples = ["t,x,y,z,yaw\n5,0,0,0.5,0\n6,1,2,0.7,1\n", "0 0 0 1 0 0 0 1\n1 1 0 1 0 0 1 0\n", trajectory_files.VICON]
     examples.append(trajectory_files.MOTIVE.replace("cf 1", "drone"))
+    examples.append(trajectory_files.TOPICS.replace("CF01", "drone"))
+    examples.append(trajectory_files.RUN.replace("R1", "drone").replace("b,1", "a,1"))
+    examples.append("# timestamp tx ty tz qw qx qy qz\n0 0 0 1 0 0 0 1\n1 1 0 1 1 0 0 0\n")
     examples.append(f"{trajectory_files.HEADER}\n{trajectory_files.piece(2, x=(0, 1), yaw=(0.5,))}\n")
 
     def take(data):
@@ -199,10 +202,14 @@ def trajectories():
 @place(8_000, 60)
 def graphs():
     """A graph beside an experiment."""
+    drawn = graph_files.LABELLED.format(graph_files.YED.format("A"), graph_files.YED.format("B"))
     examples = [
         b"A B 0.5\nB C\n",
         graph_files.MATRIX.encode(),
         graph_files.graphml('<edge source="A" target="B"/>').encode(),
+        b"A B {'weight': np.float64(0.5), 'distance': 1}\n",
+        b",source,target,distance,Type\n0,A,B,0.5,Directed\n",
+        graph_files.graphml(f'{drawn}<edge source="n0" target="n1"/>').encode(),
     ]
     with place_for("some.toml") as file:
         rows = 'graph = { file = "a.graph", target = 0.7, rows = "senders" }\n'
