@@ -22,6 +22,7 @@ FILE = """
 title = "Two robots meet"
 duration_s = 6.0
 disturbance.all.position_sigma = 0.0005
+start.deadline_s = 5.0
 [robots.A]
 kind = "khepera4"
 start = [-0.6, 0.0]
@@ -76,7 +77,6 @@ TROUBLES = {
     "fills": ("bytearray(10**11)", "the law Meet failed: MemoryError"),
     "boasts": ('print(\'{"met": 1, "of": 1}\'); os._exit(0)', "ends the process"),
     "raises": ("1 / 0", "the law Meet failed: ZeroDivisionError: division by zero (meet.py:12)"),
-    "unknown": ("x = float('nan')", "its law wants something that is not finite"),
     "empty": ("return None", "must give a Control, not nothing: is a `return` missing?"),
     "texts": ("x = 'far'", "must give three numbers as velocity or goal, not ['far', 0.0, nan]"),
     "stands": ("x = 0.0", "Apart [m] in default is 1.20 for 2 of 2 seeds"),
@@ -204,10 +204,12 @@ def test_groups_hand_in_what_they_like(course, tmp_path):
     write({}, groups / "nothing")
     write({"meet.toml": "no toml", "meet.py": LAW}, groups / "spoilt")
     write({"meet.toml": posed(FILE).replace("0.9", "9.0"), "meet.py": posed(LAW)}, groups / "cheats")
+    write({"meet.toml": FILE, "meet.py": LAW.replace(LINE, "x = float('nan')")}, groups / "unknown")
     found, _ = marked(course, *groups.iterdir(), code=1)
     assert {name: (each["met"], each["of"]) for name, each in found.items()} == {
-        "(solution)": (1, 1), "right": (1, 1), "nothing": (0, 0), "spoilt": (0, 1), "cheats": (0, 1),
+        "(solution)": (1, 1), "right": (1, 1), "nothing": (0, 0), "spoilt": (0, 1), "cheats": (0, 1), "unknown": (0, 1),
     }  # fmt: skip
+    assert "its law wants something that is not finite" in found["unknown"]["words"][0]
     assert found["spoilt"]["words"][0].startswith("meet.toml:1")
     table = zenpark("mark", groups / "right", "--from", course, "--seed", 5).stdout.splitlines()
     assert [line.split() for line in table[1:3]] == [["(solution)", "1/1", "1/1"], ["right", "1/1", "1/1"]]
