@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # cyclonedds 11.0.1: by default a reader keeps one sample of a topic: of poses that two robots publish on one topic
-# without a key only the last pose of all is left, whatever take(N=...) asks for. Guess: some history, as the 10 samples
-# of ROS 2, or one sample of each robot. With the name as the key it is one of each robot; Policy.History.KeepAll keeps
+# without a key only the last pose of all is left, whatever take(N=...) asks for. Guess: some history, or one sample of
+# each robot. With the name as the key it is one of each robot; Policy.History.KeepAll keeps
 # all.
 # Seen: of five poses of A and B each: no key [B 4], key [A 4, B 4], all 10
 set -euo pipefail

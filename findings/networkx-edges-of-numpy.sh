@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # networkx 3.6.1: distances that numpy computed, such as np.linalg.norm gives, are written into edge lists and GML as
 # np.float64(0.5), and networkx cannot read its own file back. Guess: a float64 is a float, as it is in GraphML. Who
-# saves formations so loses nothing, and gets nothing back; other readers drop the distance. float(...) helps.
+# saves formations so loses nothing, and gets nothing back. float(...) helps.
 # Seen: edge list TypeError, GML NetworkXError, GraphML 0.5; with float 0.5 from all three
 set -euo pipefail
 place=$(mktemp -d); trap 'rm -rf "$place"' EXIT

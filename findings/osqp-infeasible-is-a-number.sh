@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # osqp 1.1.3: the x of a problem without a solution is 2143289344 in every place, which are the bits of a NaN,
-# 0x7fc00000, taken for a whole number. The status says "primal infeasible". Guess: NaN or None, as releases before 1.0
-# give. A controller that asks for finite numbers only sends 2143289344 m/s to its clamp, and its robots drive at full
+# 0x7fc00000, taken for a whole number. The status says "primal infeasible". Guess: NaN, or None as 0.6.7
+# gives. A controller that asks for finite numbers only sends 2143289344 m/s to its clamp, and its robots drive at full
 # speed.
 # Seen: primal infeasible, finite True, 2143289344; dual infeasible the same
 set -euo pipefail
