@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from math import hypot, inf, isfinite, isnan
 from typing import Final
 
-from agents.safety.detection import LOWEST_DESCENT_M_S
+from agents.body.limits import LOWEST_DESCENT_M_S
 from agents.vectors import ZERO, Vector, norm
 
 FRESH_S: Final = 0.5  # older positions are lost; robots tolerate as much

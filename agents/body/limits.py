@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from math import inf
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 import msgspec
 from msgspec import Meta
 
 from agents.vectors import NotNegative, Positive, Share, Vector
+
+LOWEST_DESCENT_M_S: Final = 0.2  # [m/s] no device lands more slowly
 
 
 class Safety(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):

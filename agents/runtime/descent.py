@@ -12,13 +12,13 @@ from math import inf
 import zenoh
 
 from agents.body.interface import Body
+from agents.body.limits import LOWEST_DESCENT_M_S
 from agents.decision.lifecycle import Phase
 from agents.network import session as network
 from agents.network.name_ownership import ANSWER_S, NameKeeper
 from agents.network.shutdown import FAREWELL_S, STOPPED_S
 from agents.robot import Robot
 from agents.runtime.watchdog import AGAIN_S, DOWN_S, Watchdog
-from agents.safety.detection import LOWEST_DESCENT_M_S
 from agents.ticks import Ticks
 
 

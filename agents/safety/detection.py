@@ -12,6 +12,7 @@ from typing import ClassVar, Final
 
 from agents.body.interface import Attitude, BodyState, RangeScan
 from agents.body.kinds import Kind
+from agents.body.limits import LOWEST_DESCENT_M_S
 from agents.decision.assignment import Assignment
 from agents.decision.neighbours import Neighbour, Neighbours
 from agents.decision.perception import SCAN_S
@@ -25,7 +26,6 @@ from agents.safety.setpoint_filter import OUTSIDE_M
 from agents.vectors import NO_SETPOINT, UNKNOWN, Setpoint, Vector, is_finite, norm, planar
 
 SUNK: Final = 0.15  # [m] depth below its goal
-LOWEST_DESCENT_M_S: Final = 0.2  # [m/s] no device lands more slowly,
 CREEPS: Final = 0.025  # [m/s] largest speed of a robot that creeps
 STEP: Final = 0.05  # [m]
 STALLS_S: Final = 4.0  # [s] time after which a climb without `STEP` of gained height counts as stalled

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from agents.body.interface import UNANSWERED, BodyError
+from agents.body.limits import LOWEST_DESCENT_M_S
 from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
-from agents.safety.detection import LOWEST_DESCENT_M_S
 from agents.vectors import NO_SETPOINT, UNKNOWN
 from bridges.external import ExternalBody
 from bridges.measured_flight import GROUNDED_S, LANDING_S, MeasuredFlight

@@ -136,7 +136,7 @@ def recorder(net):
 def conductor(net):
     """The conductor follows the robots' statuses, states and tokens, and changes robots when it is asked."""
     changes = dict.fromkeys(("start", "stop", "release", "kill"), lambda *_, **__: SimpleNamespace())
-    launcher = SimpleNamespace(last_silence=-np.inf, died=list, running=lambda _name: False, **changes)
+    launcher = SimpleNamespace(last_silence=-np.inf, died=list, running=lambda _name: False, land_s=15.0, **changes)
     with tempfile.TemporaryDirectory() as name:
         folder, hosts = Path(name), Hosts(launcher, [])
         context = CaseContext(triangle(), "only", folder, folder / "x", ["tcp/127.0.0.1:1"], launcher, hosts)

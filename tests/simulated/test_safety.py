@@ -134,6 +134,14 @@ def test_computer_that_slept_lands_its_robots(since):
     assert not [text for _, text in flight.robots["C"].hazards if "it does not rise" in text]
 
 
+def test_landing_from_a_high_ceiling_gets_its_time():
+    """A climb and a landing had 15 s: the process was killed 17 s after the order, with its motors on."""
+    high = DRONE.replace("hover = 0.8", "hover = 7.0").replace('{ "A - C" = 1.1 }', "{}")
+    flight = fly(high, settings=["arena.size=[4.0, 4.0, 8.0]", "rates.body_hz=50"])
+    assert (flight.code, flight.of("default-C")[0].code) == (0, 0)
+    assert flight.robots["C"].off() > 3.0 + 15.0
+
+
 def test_second_process_ends_without_a_command():
     flight = fly(TRIO, Fault(AT_S, "twice", "A"), settings=["duration_s=5"])
     (second,) = flight.of("second A")

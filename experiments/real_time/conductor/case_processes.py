@@ -22,7 +22,7 @@ from experiments.definition.plan import Plan
 from experiments.file.document import case_document, write_json
 from experiments.real_time.conductor.orders import Emergency
 from experiments.real_time.hosts.hosts import STATION, Hosts
-from experiments.real_time.hosts.launcher import LAND_S, ZYGOTE, Launcher, Process, is_router, make_routers
+from experiments.real_time.hosts.launcher import ZYGOTE, Launcher, Process, is_router, make_routers
 from experiments.recording.reader import PARTS, RecordingError, recover
 
 ALONE_S: Final = 3.0  # limit for a robot that joins a run under way to wait for silent neighbours
@@ -314,6 +314,11 @@ class CaseProcesses:
         positions, _ = bodies.scattered_poses(reached, [name], reached.experiment.seed)
         return positions[0][:2]
 
+    @property
+    def land_s(self) -> float:
+        """Longest landing of a robot [s]."""
+        return self._launcher.land_s
+
     def companions(self, name: str) -> list[str]:
         """Robots of the same process, itself included."""
         return list(self._groups[self._group(name)])
@@ -340,7 +345,11 @@ class CaseProcesses:
     def end_robots(self) -> list[str]:
         """End the processes of all robots, which land first; return the robots with a process that had to be killed."""
         groups = {self._context.process(group): members for group, members in self._groups.items()}
-        return [name for process in self._launcher.end(groups, grace_s=LAND_S) for name in groups[process.name]]
+        return [
+            name
+            for process in self._launcher.end(groups, grace_s=self._launcher.land_s)
+            for name in groups[process.name]
+        ]
 
     def deaths(self) -> Iterator[Death]:
         """Processes that ended since the last call; recorder, router, world, centre and positioning restart,

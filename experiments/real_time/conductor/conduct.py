@@ -38,7 +38,14 @@ from experiments.real_time.conductor.orders import STARTING_S, Emergency
 from experiments.real_time.conductor.run_view import ProgressDisplay
 from experiments.real_time.hosts import run_registry
 from experiments.real_time.hosts.hosts import Hosts
-from experiments.real_time.hosts.launcher import Launcher, Router, RouterEnded, make_routers, start_routers
+from experiments.real_time.hosts.launcher import (
+    Launcher,
+    Router,
+    RouterEnded,
+    make_routers,
+    start_routers,
+    travel_s,
+)
 from experiments.real_time.hosts.run_registry import RegisteredRun
 from experiments.recording.run_folder import SOURCE
 
@@ -178,6 +185,7 @@ def _run_setup(
         unlisted = up.enter_context(run_registry.registered(me, user.emergency.obey))
         launcher = up.enter_context(user.launching(folder / "logs"))
         user.emergency.guard(launcher)
+        launcher.land_s = travel_s(max(plan.experiment.arena.size[2] for plan in embodied.values()))
         user.tell([*([unlisted] if unlisted else []), *check_other_runs(me, run_registry.runs(), str(read.path))])
         launcher.preload()
         routers = make_routers(listening, network.routers) if own_router else []

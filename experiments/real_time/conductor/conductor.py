@@ -22,10 +22,10 @@ from agents.runtime.orders import LAND, STOP
 from experiments.file.document import write_json
 from experiments.real_time.conductor import run_view
 from experiments.real_time.conductor.case_processes import CaseContext, CaseProcesses
-from experiments.real_time.conductor.hot_changes import CLIMB_S, HotChanges
+from experiments.real_time.conductor.hot_changes import HotChanges
 from experiments.real_time.conductor.orders import start_lead_s
 from experiments.real_time.hosts.hosts import Drift
-from experiments.real_time.hosts.launcher import LAND_S
+from experiments.real_time.hosts.launcher import travel_s
 from experiments.recording.playback import EARLY_S
 
 POLL_S: Final = 0.05
@@ -234,7 +234,8 @@ class Conductor(CaseRun):
                     del refused[name]
 
         # a recorder that has ended meanwhile is awaited again: a run without any would be flown for nothing
-        return self.await_phase("airborne", CLIMB_S, recorder=True, meanwhile=again)
+        highest = max((robot.hover or 0.0 for robot in self._experiment.robots.values()), default=0.0)
+        return self.await_phase("airborne", travel_s(highest), recorder=True, meanwhile=again)
 
     def _start(self) -> float:
         """Order the common start; returns its time [s, UTC]."""
@@ -348,7 +349,8 @@ class Conductor(CaseRun):
             self._view.report("stop", "conductor", f"{self._context.emergency.words}; the run ends here")
         how = "emergency stop" if self._context.emergency else "interrupted" if self._context.ended() else ""
         self._view.report("phase", "conductor", "landing" + (f" ({how})" if how else ""))
-        deadline, repeat_at = time.monotonic() + LAND_S, -inf
+        land_s = self._context.launcher.land_s
+        deadline, repeat_at = time.monotonic() + land_s, -inf
         while True:
             self._update()  # raises before robots count as late that stood still with this process
             if time.monotonic() >= repeat_at:  # a busy machine may have lost the order
@@ -360,9 +362,9 @@ class Conductor(CaseRun):
                 break
             time.sleep(POLL_S)
         for name in late:
-            self._leave_behind(name, f"did not end its landing within {LAND_S:g} s: {self._reason(name)}")
+            self._leave_behind(name, f"did not end its landing within {land_s:g} s: {self._reason(name)}")
             status = self._robots[name].status
-            if status is not None and self._clock.utc() - status.stamp > LAND_S:  # a process that stands still
+            if status is not None and self._clock.utc() - status.stamp > land_s:  # a process that stands still
                 self._processes.kill(name)
         self._progress.phase = "done"
         self._show(self._progress)

@@ -27,10 +27,9 @@ from experiments.definition.experiment import WORLD, RobotTable
 from experiments.definition.plan import Plan
 from experiments.real_time.conductor.case_processes import CaseProcesses
 from experiments.real_time.conductor.run_view import NetworkView, RobotView
-from experiments.real_time.hosts.launcher import LAND_S
+from experiments.real_time.hosts.launcher import travel_s
 from experiments.scene.condition import SILENT_S
 
-CLIMB_S: Final = 15.0  # limit for a robot to climb
 READY_S: Final = 5.0  # a robot starts later, and counts the deadline of the file from then
 ROOM_S: Final = 20.0  # limit for the place of a robot to become free, where no operator waits for an answer
 RESTARTS: Final = 3  # a robot that is lost more often is not helped by a restart
@@ -234,16 +233,17 @@ class HotChanges:
                 self._view.report("silent", name, f"does not answer ({reply.reason}): its lifeline is cut")
                 processes.release(name)
         began, killed = time.monotonic(), False
+        land_s = processes.land_s
         while still := [name for name in present if self._robots[name].alive or (processes.runs(name) and not staying)]:
             past = time.monotonic() - began
-            if past > LAND_S and kept:
-                raise Refusal(f"{', '.join(still)}: ordered to land, but still there after {LAND_S:g} s; it {kept}")
-            if not (killed or kept) and (past > LAND_S or (past > SILENT_S and all(map(self._frozen, still)))):
+            if past > land_s and kept:
+                raise Refusal(f"{', '.join(still)}: ordered to land, but still there after {land_s:g} s; it {kept}")
+            if not (killed or kept) and (past > land_s or (past > SILENT_S and all(map(self._frozen, still)))):
                 killed = True
                 for name in still:
                     self._view.report("killed", name, f"still there after {past:.0f} s")
                     processes.kill(name)
-            if past > LAND_S + SILENT_S:
+            if past > land_s + SILENT_S:
                 raise Refusal(f"{', '.join(still)}: cannot be ended")
             yield
         for name in names:
@@ -311,7 +311,8 @@ class HotChanges:
             for name in names:
                 order = messages.Order("takeoff", at=self._start, origin=robots[name].origin)
                 yield from self._repeat_order(name, order)
-            yield from self._reach(names, "airborne", CLIMB_S)
+            highest = max(self._processes.robot(name).hover or 0.0 for name in names)
+            yield from self._reach(names, "airborne", travel_s(highest))
             for name in names:
                 order = messages.Order("start", at=self._start, origin=robots[name].origin)
                 yield from self._repeat_order(name, order)

@@ -29,11 +29,10 @@ from experiments.real_time.conductor import preflight_checks as checks
 from experiments.real_time.conductor.case_processes import CaseContext
 from experiments.real_time.conductor.conduct import RunOptions, Supervision, run_setup, with_bodies
 from experiments.real_time.conductor.conductor import CaseRun
-from experiments.real_time.conductor.hot_changes import CLIMB_S
 from experiments.real_time.conductor.orders import start_lead_s
 from experiments.real_time.conductor.preflight_checks import DRIVE_M, HOP_M, Check, Observed, RobotChecks, Tried
 from experiments.real_time.conductor.run_view import ShowProgress
-from experiments.real_time.hosts.launcher import LAND_S
+from experiments.real_time.hosts.launcher import travel_s
 
 PREFLIGHT: Final = "preflight"  # name of the case, in files and on the console
 SAMPLE_S: Final = 2.0  # time for which robots are observed at rest
@@ -262,18 +261,19 @@ class Inspector(CaseRun):
             return True
 
         if robot.hover is None:
-            self._wait(DRIVE_S + start_lead_s(1) + LAND_S, over)
+            self._wait(DRIVE_S + start_lead_s(1) + travel_s(0.0), over)
         else:
-            self._wait(CLIMB_S, lambda: over() or seen.reached("airborne"))
+            limit_s = travel_s(robot.hover)
+            self._wait(limit_s, lambda: over() or seen.reached("airborne"))
             if tried.failure:
                 return
             if not seen.reached("airborne"):
-                tried.failure = f"not at {robot.hover:g} m after {CLIMB_S:g} s: {self._reason(name)}"
+                tried.failure = f"not at {robot.hover:g} m after {limit_s:g} s: {self._reason(name)}"
             elif not self._wait(hold_s, over) and not tried.failure:
                 tried.states = list(tried.states)  # the landing is no part of it
                 self._order(name, messages.Order("land"))
-                if not self._wait(LAND_S, lambda: seen.reached("done") or name in self._ended):
-                    tried.failure = f"not down after {LAND_S:g} s: {self._reason(name)}"
+                if not self._wait(limit_s, lambda: seen.reached("done") or name in self._ended):
+                    tried.failure = f"not down after {limit_s:g} s: {self._reason(name)}"
                 return
         status = seen.status
         if name in self._ended or (status is not None and status.hazard):

@@ -25,6 +25,7 @@ from math import inf
 from pathlib import Path
 from typing import IO, Final, Self
 
+from agents.body.limits import LOWEST_DESCENT_M_S
 from agents.clock import Clock, uptime
 from agents.errors import ExplainedError
 from agents.network import messages
@@ -36,7 +37,7 @@ from experiments.real_time.processes.zygote import Forked, NoZygote
 
 ROUTER: Final = "router"  # the first; others are router2, router3, ...
 ZYGOTE: Final = "zygote"
-LAND_S: Final = 15.0  # time for robots to come down after their lifeline was cut
+LAND_S: Final = 15.0  # least time for robots to come down after their lifeline was cut
 LINGER_S: Final = 15.0  # the router outlives a killed conductor, so that the landing is recorded
 READY_S: Final = 15.0  # limit for a process to say that it is ready
 TURN_S: Final = 0.2  # time for which an end is awaited at once
@@ -144,12 +145,18 @@ class Process:
                 os.killpg(self.handle.pid, number)
 
 
+def travel_s(height: float) -> float:
+    """Limit [s] for a climb or a landing over a `height` [m], at the speed of the slowest descent."""
+    return max(LAND_S, height / LOWEST_DESCENT_M_S)
+
+
 class Launcher:
     """Processes of one run; a context manager that leaves none behind."""
 
     def __init__(self, logs: Path) -> None:
         """Output of each process goes to a file in the folder `logs`."""
         self._logs = logs
+        self.land_s = LAND_S  # longest landing of its robots [s]
         # the clock of modules that are started here; None: each reads the wall clock itself
         self.clock: Clock | None = None
         self._processes: dict[str, Process] = {}
@@ -167,7 +174,7 @@ class Launcher:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.end([name for name in self._processes if not is_router(name)], grace_s=LAND_S)
+        self.end([name for name in self._processes if not is_router(name)], grace_s=self.land_s)
         self.end(list(self._processes), grace_s=0.0)  # all robots are down: no router is needed any more
         self._forget_zygote()
         self._over.set()

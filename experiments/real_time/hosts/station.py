@@ -27,11 +27,12 @@ from agents.clock import Clock, wait_until
 from agents.errors import ExplainedError
 from agents.network import lab, messages
 from agents.network import session as network
+from agents.network.shutdown import AFTER_S
 from agents.plugins import registry
 from agents.runtime.lifeline import FAR_SILENCE_S, stop_line
 from experiments.definition.bodies import missing_library
 from experiments.real_time.hosts import certificates, run_registry
-from experiments.real_time.hosts.launcher import LAND_S, RUN, tagged
+from experiments.real_time.hosts.launcher import RUN, tagged
 from experiments.real_time.hosts.run_registry import RegisteredRun, StopReport
 from experiments.real_time.processes import zygote
 from experiments.real_time.processes.zygote import NoZygote
@@ -213,7 +214,7 @@ def kill(pids: Sequence[int]) -> list[int]:
     return killed
 
 
-def serve(fd: int = 0, patience_s: float = LAND_S) -> int:
+def serve(fd: int = 0, patience_s: float = AFTER_S) -> int:
     """Answer until the lifeline is lost, then wait for `patience_s` [s] until the robots are down; return 0."""
     here = Clock()
     decoder = msgspec.json.Decoder(Question)

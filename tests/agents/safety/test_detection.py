@@ -6,11 +6,11 @@ from types import SimpleNamespace
 import pytest
 
 from agents.body.interface import BodyState, RangeScan
-from agents.body.limits import Limits
+from agents.body.limits import LOWEST_DESCENT_M_S, Limits
 from agents.decision.neighbours import Incoming, Neighbours
 from agents.decision.situation import LATE_SHARE, SILENT_S, ProcessHealth, Situation
 from agents.plugins.predictors import HOLD
-from agents.safety.detection import FOREIGN_S, LOWEST_DESCENT_M_S, Detector, RobotStatus, tilt_angle, tilted
+from agents.safety.detection import FOREIGN_S, Detector, RobotStatus, tilt_angle, tilted
 from agents.safety.hazards import Cause, Hazards, Outcome
 from agents.safety.preflight import FRAME, LOST_S, Preflight
 from agents.safety.setpoint_filter import SetpointFilter

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from agents.body.interface import UNANSWERED
-from agents.safety.detection import LOWEST_DESCENT_M_S
+from agents.body.limits import LOWEST_DESCENT_M_S
 from agents.vectors import ZERO
 from bridges.crazyflie import flight as module
 from bridges.crazyflie import pilot

@@ -32,7 +32,7 @@ from bridges.crazyflie.protocol.tables import LOG_CODES, PACKINGS
 from bridges.crazyflie.telemetry import Telemetry
 from bridges.crazyflie.twin.device import CrazyflieTwin
 from bridges.crazyflie.twin.supervisor import SupervisorState
-from experiments.real_time.conductor.hot_changes import CLIMB_S
+from experiments.real_time.hosts.launcher import LAND_S
 from tests.bridges.crazyflie.flights import clocked
 from tests.cases import nightly
 from tests.requests import request
@@ -368,7 +368,7 @@ def test_gaps_after_the_take_off(monkeypatch):
         assert np.max(gaps, axis=0) == pytest.approx(1.2, abs=0.02)
 
 
-@pytest.mark.parametrize(("height", "soon"), [(0.5, 3.0), (2.0, 9.0), nightly(4.0, CLIMB_S - 1.0)])
+@pytest.mark.parametrize(("height", "soon"), [(0.5, 3.0), (2.0, 9.0), nightly(4.0, LAND_S - 1.0)])
 def test_ready_at_height_in_spite_of_the_overshoot(fleet, height, soon):
     """Followed by lifecycle and detectors as in a robot's process, for 12 s at its height."""
     lifecycle, setpoint = Lifecycle(CRAZYFLIE, height, 100.0), (0.0, 0.0, height, 0.0)

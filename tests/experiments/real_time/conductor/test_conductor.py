@@ -57,7 +57,7 @@ class Course(Conductor):
         self.failures, self._starting, self._landed, self._held = [], set(), {}, set()
         self.reasons = {}  # of robots that have landed at 3 s, before all others
         self._changes = self._drift = MagicMock(under_way=())
-        self._context = MagicMock(ended=lambda: False, emergency=None)
+        self._context = MagicMock(ended=lambda: False, emergency=None, launcher=MagicMock(land_s=LAND_S))
         self.processes = self._processes = MagicMock(deaths=self._died, recording=True)
         self.view = self._view = MagicMock(update=self._phase, recorder_stands_still=False, recording_begun=True)
         self.update, self.land = self._update, self._land

@@ -25,6 +25,8 @@ PHASES = {"takeoff": "airborne", "start": "running"}
 class Stage:
     """The triangle in flight, with a spare, as view and processes of a run; all obey at once, unless they hang."""
 
+    land_s = 15.0
+
     def __init__(self, monkeypatch, **more):
         self.clock = ManualClock(START)
         monkeypatch.setattr(hot_changes, "time", self.clock)
