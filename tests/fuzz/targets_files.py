@@ -184,7 +184,7 @@ def crazyflies_yaml():
 def trajectories():
     """Plans from files: each can be asked for any time."""
     examples = ["t,x,y,z,yaw\n5,0,0,0.5,0\n6,1,2,0.7,1\n", "0 0 0 1 0 0 0 1\n1 1 0 1 0 0 1 0\n", trajectory_files.VICON]
-    examples.append(trajectory_files.MOTIVE.replace("cf 1", "drone"))
+    examples += [trajectory_files.MOTIVE.replace("cf 1", "drone"), trajectory_files.QTM]
     examples.append(trajectory_files.TOPICS.replace("CF01", "drone"))
     examples.append(trajectory_files.RUN.replace("R1", "drone").replace("b,1", "a,1"))
     examples.append("# timestamp tx ty tz qw qx qy qz\n0 0 0 1 0 0 0 1\n1 1 0 1 1 0 0 0\n")

@@ -1,4 +1,4 @@
-"""Formats of files with poses over time: CSV with named columns, TUM, exports of Vicon and Motive, Crazyswarm's
+"""Formats of files with poses over time: CSV with named columns, TUM, exports of Vicon, Motive and QTM, Crazyswarm's
 polynomials.
 
 The text itself shows its format. Errors name the line, and behind `; ` the remedy.
@@ -18,8 +18,8 @@ from agents.plugins.recorded.curves import AXES, ORDER, Curve, Piece, Polynomial
 Rows = Sequence[tuple[int, list[str]]]  # numbers of lines, and their cells
 
 FORMS: Final = (
-    "a CSV begins with names such as t,x,y,z,yaw; TUM has lines t x y z qx qy qz qw; the exports of Vicon and Motive, "
-    "and Crazyswarm's polynomials are known too"
+    "a CSV begins with names such as t,x,y,z,yaw; TUM has lines t x y z qx qy qz qw; the exports of Vicon, Motive "
+    "and QTM, and Crazyswarm's polynomials are known too"
 )
 UNITS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "m": 1.0, "cm": 1e-2, "mm": 1e-3, "rad": 1.0}
 UNITS_OF_ANGLES: Final = {"deg": radians(1.0), "°": radians(1.0)}
@@ -40,6 +40,8 @@ COLUMNS: Final = {name: column for column, names in NAMES.items() for name in na
 UNIT: Final = re.compile(r"(.+?)\s*(?:\[\s*([\w°]+)\s*\]|\(\s*([\w°]+)\s*\)|_(ns|us|ms|s|mm|cm|m|rad|deg))")
 VICON_HEADER: Final = "frame,sub frame,"
 MOTIVE_HEADER: Final = "frame,time"
+QTM_HEADER: Final = "frame\ttime\t"
+HIDDEN: Final = ("", "NULL")  # cells of a body that was not seen
 RIGID_BODY: Final = "Rigid Body"  # kind of a body in Motive's export
 MOTIVE_UNITS: Final = {"meters": 1.0, "centimeters": 1e-2, "millimeters": 1e-3}
 FARTHEST: Final = 1e4  # largest place [m] or angle [rad]
@@ -64,10 +66,8 @@ def read(text: str, body: str = "", up: str = "y") -> Curve:
     """
     lines = text.lstrip("\ufeff").replace("\r\n", "\n").split("\n")
     for head, line in enumerate(lines[:20]):
-        if line.lower().startswith(VICON_HEADER):
-            return Samples(_exported(lines, head, body, _vicon(lines, head, body)))
-        if line.lower().startswith(MOTIVE_HEADER) and head > 1:
-            return Samples(_exported(lines, head, body, _motive(lines, head, body, up)))
+        if (columns := _columns_of_export(lines, head, line.lower(), body, up)) is not None:
+            return Samples(_exported(lines, head, body, columns))
     rows = _rows(lines, body)
     if not rows:
         raise FormatError(f"the file holds no numbers; {FORMS}")
@@ -268,6 +268,15 @@ class Export(NamedTuple):
     factors: dict[str, float]
 
 
+def _columns_of_export(lines: Sequence[str], head: int, line: str, body: str, up: str) -> Export | None:
+    """Columns of an export, if this line names them."""
+    if line.startswith(VICON_HEADER):
+        return _vicon(lines, head, body)
+    if line.startswith(QTM_HEADER):
+        return _qtm(lines, head, body)
+    return _motive(lines, head, body, up) if line.startswith(MOTIVE_HEADER) and head > 1 else None
+
+
 def _exported(lines: Sequence[str], head: int, body: str, columns: Export) -> list[TimedPose]:
     """Poses of a body below the line `head` with the names of the columns, without frames in which it was hidden."""
     rows = list[tuple[int, list[str]]]()
@@ -276,7 +285,9 @@ def _exported(lines: Sequence[str], head: int, body: str, columns: Export) -> li
         if not any(cells) and rows:
             break  # the next section of the file
         # neither a line of units, nor one without the body
-        if _is_number(cells[0]) and all(k < len(cells) and cells[k] for k in columns.places.values()):
+        if not _is_number(cells[0]) or any(k >= len(cells) or cells[k] in HIDDEN for k in columns.places.values()):
+            continue
+        if any(cells[columns.places[axis]].strip("-0.") for axis in "xyz"):  # QTM writes zeros for a hidden body
             rows.append((number, cells))
     found = _samples(rows, *columns)
     for before, after in pairwise(found):
@@ -287,7 +298,7 @@ def _exported(lines: Sequence[str], head: int, body: str, columns: Export) -> li
 
 
 def _cells(line: str) -> list[str]:
-    return [cell.strip().strip('"') for cell in line.split(",")]
+    return [cell.strip().strip('"') for cell in line.split("\t" if "\t" in line else ",")]
 
 
 def _chosen(bodies: Collection[str], body: str, line: int) -> str:
@@ -320,6 +331,19 @@ def _vicon(lines: Sequence[str], head: int, body: str) -> Export:
     places |= {name: place[f"r{name[1]}"] for name in turn if f"r{name[1]}" in place}
     factors = {"t": 1.0 / rates[0], **dict.fromkeys("xyz", 1e-3)}
     return Export(places, factors | dict.fromkeys(turn, UNITS_OF_ANGLES.get(unit, 1.0)))
+
+
+def _qtm(lines: Sequence[str], head: int, body: str) -> Export:
+    """QTM's export: its settings, then names of the columns, of which the first of each body has its name, numbers."""
+    columns = _cells(lines[head])
+    begins = {name.removesuffix(" X"): k for k, name in enumerate(columns) if name.endswith(" X")}
+    if not begins:
+        raise FormatError(f"line {head + 1}: no column ends with X; export 6D data from QTM, with the header")
+    begin = begins[_chosen(begins, body, head + 1)]
+    places = {"t": 1, **{axis: begin + k for k, axis in enumerate("xyz")}}
+    if columns[begin + 5 : begin + 6] == ["Yaw"]:
+        places["yaw"] = begin + 5
+    return Export(places, {**dict.fromkeys("xyz", 1e-3), "yaw": radians(1.0)})
 
 
 def _motive(lines: Sequence[str], head: int, body: str, up: str) -> Export:

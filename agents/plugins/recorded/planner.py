@@ -19,7 +19,7 @@ JUMP: Final = 0.02  # pieces that are farther apart than this do not belong toge
 
 
 class Recorded(Planner, frozen=True):
-    """Poses over time from a file: CSV, TUM, exports of Vicon and Motive, or polynomials of Crazyswarm; then stay."""
+    """Poses over time from a file: CSV, TUM, exports of motion capture, polynomials of Crazyswarm; then stay."""
 
     FILES: ClassVar[Mapping[str, str]] = {"file": "content"}
 

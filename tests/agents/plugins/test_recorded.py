@@ -39,6 +39,17 @@ RUN = "case,time,robot,x,y,yaw\na,0,R1,0,0,0\na,0,R2,1,0,0\nb,1,R1,1,0,0\nb,1,R2
 TOPICS = f"time,{','.join(NAMES)}\n0,0,1,5,6\n1,1,1,6,6\n"  # as PlotJuggler writes them
 
 
+QTM = """NO_OF_FRAMES	3
+FREQUENCY	100
+DATA_INCLUDED	6D
+BODY_NAMES	drone	wand
+Frame	Time	drone X	Y	Z	Roll	Pitch	Yaw	Residual	wand X	Y	Z	Roll	Pitch	Yaw	Residual
+1	0.00000	100.0	200.0	300.0	0	0	90.0	0.5	1	1	1	0	0	0	0.5
+2	0.01000	0.000	0.000	0.000	0	0	0.0	-1	1	1	1	0	0	0	0.5
+3	0.02000	110.0	200.0	300.0	0	0	91.0	0.5	NULL	NULL	NULL	0	0	0	0.5
+"""
+
+
 def piece(duration, **axes):
     """Line of a piece; of each axis its first coefficients."""
     values = [each for name in ("x", "y", "z", "yaw") for each in (*axes.get(name, ()), *[0] * 8)[:8]]
@@ -72,6 +83,7 @@ def content(text):
         (RUN.replace("b,1", "a,1"), "R2", {0.5: (1.5, 0, nan, 0)}),
         ("t,x,y\n0,0,0\n1,1,1\n", "CF01", {0.5: (0.5, 0.5, nan, nan)}),
         (VICON, "drone", {0.0: (0.1, 0.2, 0.3, radians(90)), 0.01: (0.11, 0.2, 0.3, radians(90.5))}),
+        (QTM, "drone", {0.0: (0.1, 0.2, 0.3, radians(90)), 0.01: (0.105, 0.2, 0.3, radians(90.5))}),
         (MOTIVE, "cf 1", {0.0: (0.1, 0.2, 0.3, radians(90)), 0.1: (0.15, 0.2, 0.3, radians(45))}),
         (f"{HEADER}\n{piece(2, x=(0, 1), yaw=(0.5,))}\n{piece(1, x=(2, 1, -0.5), y=(0, 0, 0, 1), yaw=(0.5,))}\n", "",
          {1.0: (1, 0, 0, 0.5), 2.5: (2.375, 0.125, 0, 0.5), 9.0: (2.5, 1, 0, 0.5)}),
@@ -103,6 +115,8 @@ def test_formats_hold_these_poses(text, body, poses):
         (VICON, 'line 3: it has drone, wand; write body = "drone"'),
         (VICON.replace("100\n", "\n", 1), "no rate stands above"),
         (VICON.replace("TX", "MX"), "line 4: no columns TX"),
+        (QTM, 'line 5: it has drone, wand; write body = "drone"'),
+        (QTM.replace(" X", " E"), "line 5: no column ends with X; export 6D data from QTM"),
         (MOTIVE, 'line 4: it has cf 1, wand; write body = "cf 1"'),
         (MOTIVE.replace("Length Units", "Scale"), "line 1: no Length Units; export from Motive in meters"),
         (MOTIVE.replace("Rigid Body", "Marker"), "line 7: no rigid body; export from Motive with Rigid Bodies"),
