@@ -127,7 +127,7 @@ def digest_of_code(root: Path = ROOT) -> str:
     texts = dict[str, str]()
     while left:
         file = left.pop()
-        if file in seen or not file.is_file():
+        if file in seen or root not in file.parents or not file.is_file():
             continue
         name = file.relative_to(root).as_posix()
         if name.startswith(DRAWING):

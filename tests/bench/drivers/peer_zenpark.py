@@ -18,7 +18,6 @@ from tests.bench.drivers import ring
 HZ = round(1.0 / ring.STEP_S)
 HOVER = {"crazyflie": ", hover = 0.8"}  # [m]
 DURATION_S = 10.0
-WARM_S = 1.5  # of a flight, after which compiled stretches have begun
 FORMED_S = 10.0  # after which links are within their tolerance
 
 
@@ -48,7 +47,7 @@ def experiment(robots, kind, engine, duration_s):
 
 
 def measure(robots, kind, engine, evaluator, duration_s, *, complete=False):
-    """CPU time of parts of a run: reading, all up to `WARM_S`, the loop from there to the end, metrics.
+    """CPU time of parts of a run: reading, all up to the common start, the loop from there to the end, metrics.
 
     With the peak memory of this process.
 
@@ -60,21 +59,17 @@ def measure(robots, kind, engine, evaluator, duration_s, *, complete=False):
         SystemExit: If it did not, or if nothing was compiled.
     """
     stretch.WORK[:] = [{"plain": -math.inf, "compiled": math.inf}[evaluator]] * 2
-    start_s, start = 0.0, 0.0
-
-    def progress(now):
-        nonlocal start_s, start
-        if now <= WARM_S:
-            start_s, start = now, time.process_time()
-
     begun = time.process_time()
     read = document.loads(experiment(robots, kind, engine, duration_s))
     loaded = time.process_time()
     ((case, flown),) = read.cases().items()
     flight = VirtualRun(flown, seed=1, quiet=True, lean=False)
-    flight.fly(landing=False, progress=progress, watch=None)
+    moment = flight.begin()
+    start = time.process_time()
+    flight.decide(moment)
+    flight.fly(landing=False, progress=lambda _: None, watch=None)
     end = time.process_time()
-    ticks = round((duration_s - start_s) * HZ)
+    ticks = round(duration_s * HZ)
     found = {"cpu_s": end - start, "agent_steps": ticks * robots, "read_s": loaded - begun, "start_s": start - loaded}
     if evaluator == "compiled" and (flight.stretches is None or flight.stretches.flown < 0.9 * ticks):
         raise SystemExit(f"not compiled: {stretch.REFUSED}")

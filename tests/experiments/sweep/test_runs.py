@@ -167,6 +167,7 @@ def copied(tmp_path_factory):
     root = tmp_path_factory.mktemp("code")
     for package in ("agents", "bridges", "twins", "experiments"):
         shutil.copytree(ROOT / package, root / package, ignore=shutil.ignore_patterns("__pycache__"))
+    root.with_suffix(".py").write_text("a file beside the code\n")
     return root, digest_of_code.__wrapped__(root)
 
 
