@@ -371,10 +371,11 @@ class Session(Node):
             self._declare(each, each.key)
         self._send(router.change)
 
-    def _follow_link(self, listener: Callable[[Any], object], *, history: bool = False) -> None:
+    def _follow_link(self, listener: Callable[[Any], object], *, history: bool = False) -> object:
         self._link_listeners.append(listener)
         if self.link is not None and history:
             self._tell_of_link(self.link, PUT)
+        return listener
 
     def _tell_of_link(self, link: Link, kind: zenoh.SampleKind) -> None:
         for listener in self._link_listeners:
