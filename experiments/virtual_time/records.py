@@ -117,12 +117,17 @@ class Layouts:
         self._of: dict[
             int, tuple[Any, RecordLayout | None]
         ] = {}  # layouts by identity; the object is kept, or another would take it
-        self.guessed = False  # whether a list was empty of which no other one was filled
+        self._empty = set[tuple[type, str] | None]()  # attributes with a list that was empty then
+
+    @property
+    def guessed(self) -> bool:
+        """Whether a list was empty of which another one was filled later."""
+        return not self._empty.isdisjoint(self._filled)
 
     def forget(self) -> None:
         """Forget all objects, to look at them again."""
         self._of.clear()
-        self.guessed = False
+        self._empty.clear()
 
     def kind(self, value: Any, where: tuple[type, str] | None = None) -> Any:
         """Kind of a value, None if it has no place in a record; `where`: class and name of the attribute."""
@@ -141,7 +146,8 @@ class Layouts:
     def _kind_of_items(self, value: Sequence[Any], where: tuple[type, str] | None) -> Any:
         if not value:
             found = None if where is None else self._filled.get(where)
-            self.guessed = self.guessed or found is None
+            if found is None:
+                self._empty.add(where)
             return found
         of = set(map(type, value))
         if of == {float}:
