@@ -42,7 +42,7 @@ def compilation(analysis: Analysis) -> Iterator[Finding]:
     foreign = [each for each in ticking_plugins(plan) if each.__module__.partition(".")[0] != "agents"]
     if foreign and machine.works():
         text, gain = uncompiled(isolated(plan).changed(avoidance=plan.experiment.avoidance))
-        cost = f"runs in virtual time and sweeps take {'2 to 8' if gain > 1.0 else '10 to 20'} times as long"
+        cost = f"runs in virtual time and sweeps take {'2 to 8' if gain > 1.0 else '8 to 12'} times as long"
         message = f"{plain(text)}, which is not compiled: {cost} (docs/plugins.md, the subset)"
         yield from [Finding("remark", "uncompiled", message)] if text else ()
 
