@@ -5,7 +5,8 @@ accelerates beside each command by that angle. From 60° on it circles wider and
 axes flies away, faster and faster: it accelerates against its commands. The check compares the acceleration that
 follows from commanded and measured velocities with the measured one. Their correlation tells the angle as soon as the
 drone wobbles by some centimetres. A push, noise or a lag of another size turns nothing. A wind does for a moment, and
-so do circles by late positions, but not by as much as swapped axes.
+so do circles by late positions, but not by as much as swapped axes. Commands that shake, and take effect late, make a
+right drone accelerate against those of the moment, to and fro: it does not get far.
 
 Quiet: all of it.
 """
@@ -17,7 +18,7 @@ from typing import Final
 
 from agents.body.kinds import Kind
 from agents.ticks import ROUNDING_S
-from agents.vectors import ZERO, Vector
+from agents.vectors import ZERO, Vector, clamp
 
 SAMPLE_S: Final = 0.05  # time from one comparison to the next
 MISSED_S: Final = 0.3  # time without a comparison after which the acceleration is unknown
@@ -29,14 +30,15 @@ ASIDE: Final = (
 )
 AGAINST: Final = 2.0  # [rad] smallest angle of swapped or mirrored axes; late ones on circles show up to 1.1
 AGAINST_S: Final = 0.3  # time for which that counts: a gust is shorter
+AGAINST_M: Final = 0.06  # [m] least motion that was not commanded of late: one that is shaken moves by less
 
 
 class DirectionCheck:
     """Commanded and measured accelerations of one drone, seen from above."""
 
     __slots__ = (
-        "against", "angle", "asks", "by_position", "cross", "due", "gain", "inline", "lag", "last", "moves",
-        "opposed_s", "response", "speed", "turned", "velocity", "x", "y",
+        "against", "angle", "asks", "by_position", "cross", "due", "gain", "inline", "lag", "last", "moved_x",
+        "moved_y", "moves", "opposed_s", "response", "speed", "turned", "velocity", "way_x", "way_y", "x", "y",
     )  # fmt: skip
 
     def __init__(self, kind: Kind) -> None:
@@ -50,6 +52,8 @@ class DirectionCheck:
         """Restart."""
         self.turned = False  # the drone accelerates beside its commands
         self.against, self.opposed_s = False, 0.0  # it accelerates against them; duration so far [s]
+        self.way_x = self.way_y = 0.0  # commanded of late [m]
+        self.moved_x = self.moved_y = 0.0  # measured of late [m]
         self.angle = 0.0  # angle by this comparison [rad]
         self.last = self.due = -inf  # times of the last comparison and of the next [s]
         self.velocity = ZERO  # velocity at the last comparison [m/s]
@@ -67,10 +71,12 @@ class DirectionCheck:
         if self.by_position:
             x, y = self.response * (x - position[0]), self.response * (y - position[1])
         share = min(self.speed / max(sqrt(x * x + y * y), self.speed), 1.0)
-        x, y = self.gain * (share * x - velocity[0]), self.gain * (share * y - velocity[1])
+        x, y = share * x, share * y
         before, self.velocity = self.velocity, velocity
         if since < MISSED_S:
+            self.follow_way(since, x, y)
             self.compare(since, (velocity[0] - before[0]) / since, (velocity[1] - before[1]) / since)
+            x, y = self.gain * (x - velocity[0]), self.gain * (y - velocity[1])
             tilts = since / (self.lag + since)
             self.x += tilts * (x - self.x)
             self.y += tilts * (y - self.y)
@@ -85,6 +91,24 @@ class DirectionCheck:
         self.angle = atan2(self.cross, self.inline)
         alike = self.inline * self.inline + self.cross * self.cross > ALIKE * ALIKE * self.asks * self.moves
         moving = alike and self.asks > LEAST * LEAST * FORGET_S
-        self.turned = moving and abs(self.angle) > ASIDE
-        self.opposed_s = self.opposed_s + since if moving and abs(self.angle) > AGAINST else 0.0
-        self.against = self.opposed_s > AGAINST_S
+        opposed = moving and abs(self.angle) > AGAINST
+        strays = opposed and self.strays()
+        self.turned = moving and abs(self.angle) > ASIDE and (strays or not opposed)
+        self.opposed_s = self.opposed_s + since if opposed else 0.0
+        self.against = strays and self.opposed_s > AGAINST_S
+
+    def follow_way(self, since: float, x: float, y: float) -> None:
+        """Add the ways that x, y [m/s] commands in `since` [s], and that the drone moves."""
+        keep = exp(-since / FORGET_S)
+        self.way_x = keep * self.way_x + since * x
+        self.way_y = keep * self.way_y + since * y
+        self.moved_x = keep * self.moved_x + since * self.velocity[0]
+        self.moved_y = keep * self.moved_y + since * self.velocity[1]
+
+    def strays(self) -> bool:
+        """Whether it moved aside of what was commanded of late, or against that."""
+        way_x, way_y = self.way_x, self.way_y
+        along = (self.moved_x * way_x + self.moved_y * way_y) / max(way_x * way_x + way_y * way_y, 1e-9)
+        share = clamp(along, 0.0, 1.0)
+        x, y = self.moved_x - share * way_x, self.moved_y - share * way_y
+        return x * x + y * y > AGAINST_M * AGAINST_M

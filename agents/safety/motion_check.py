@@ -250,10 +250,11 @@ class MotionCheck:
         """Learn what a piece with a motion of x, y [m] commanded in vain; no more than a slow command."""
         way_x, way_y = 0.5 * (self.way[0] + self.way_before[0]), 0.5 * (self.way[1] + self.way_before[1])
         vain_x, vain_y = way_x - x, way_y - y
-        if vain_x * way_x + vain_y * way_y > 0.0:  # else it drifts
+        push_x, push_y = self.push_x, self.push_y
+        fades = vain_x * vain_x + vain_y * vain_y < push_x * push_x + push_y * push_y
+        if fades or vain_x * way_x + vain_y * way_y > 0.0:  # else it drifts
             rests = x * x + y * y < MOVES * MOVES * (way_x * way_x + way_y * way_y)
             share = PIECE_S / (RESTS_S if rests else MOVES_S)
-            push_x, push_y = self.push_x, self.push_y
             push_x, push_y = push_x + share * (vain_x - push_x), push_y + share * (vain_y - push_y)
             most = self.slow * PIECE_S
             less = most / max(sqrt(push_x * push_x + push_y * push_y), most)

@@ -23,7 +23,7 @@ def kicked(flown, speed):
 
 
 @pytest.mark.parametrize("timeline", [[], LINE], ids=["hover", "line"])
-@pytest.mark.parametrize("degrees", [60.0, -60.0, 90.0])
+@pytest.mark.parametrize("degrees", [60.0, -60.0, 90.0, 180.0])
 def test_turned_frame_is_cut_early(degrees, timeline):
     flown = Flown(faults={"capture": "turned", "capture_by": radians(degrees)}, timeline=timeline).fly(12.0)
     assert flown.robot.lifecycle.phase == DONE

@@ -8,6 +8,7 @@ from agents.body.kinds import KINDS
 from agents.safety.motion_check import MotionCheck
 from bridges.crazyflie.kind import CRAZYFLIE
 from bridges.khepera4.kind import KHEPERA4
+from bridges.tello.kind import TELLO
 from bridges.turtlebot3.kind import TURTLEBOT3
 
 DT, FINE = 0.01, (False, False)
@@ -90,6 +91,13 @@ def test_robot_that_moves_without_being_told(kind):
     assert Told(kind).go(3.0, told=0.5 * kind.speed, speed=-0.5 * kind.speed) == (False, True)
     robot.position = (30.0, 30.0, 30.0)  # it was carried
     assert robot.go(3.0) == FINE
+
+
+@pytest.mark.parametrize("kind", [CRAZYFLIE, TELLO], ids=lambda kind: kind.name)
+def test_wind_that_dies_is_forgotten(kind):
+    robot = Told(kind)
+    assert robot.go(10.0, told=0.2 * kind.speed) == FINE
+    assert robot.go(20.0, told=0.15 * kind.speed, speed=0.16 * kind.speed) == FINE
 
 
 def sways(robot, seconds, *, sign, ways=0.0, turns=0.0):

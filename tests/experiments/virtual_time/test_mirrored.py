@@ -1,9 +1,13 @@
 """Robots that move against their commands end a run, with the probable cause; right ones raise no alarm."""
 
+import math
+
 import numpy as np
 import pytest
 
 from agents.body.interface import Disturbance
+from agents.body.kinds import KINDS
+from agents.safety.direction_check import DirectionCheck
 from agents.safety.hazards import Cause, Outcome, failed
 from experiments.definition.experiment import LegTable, RobotTable
 from experiments.file import document
@@ -11,6 +15,7 @@ from tests.experiments.virtual_time.evaluators import evaluated
 from tests.small import small
 from twins.models.differential import Differential
 from twins.models.onboard_flight import OnboardFlight
+from twins.models.quadrotor import Quadrotor
 
 drones = pytest.mark.parametrize("kind", ["crazyflie", "tello"])
 
@@ -66,3 +71,21 @@ def test_steady_wind_is_no_fault(radius, period_s, kind):
     wind = [0.65, -0.75] if kind == "crazyflie" else [0.4, -0.5]
     log = flown(kind, Disturbance(position_sigma=0.0005, wind=wind), kind="circle", radius=radius, period_s=period_s)
     assert not log.incidents
+
+
+@pytest.mark.parametrize(("hz", "late_s"), [(2.0, 0.3), (3.0, 0.2), (4.0, 0.1), (4.0, 0.2), (5.0, 0.1)])
+@drones
+def test_late_shaken_drone_is_not_mirrored(hz, late_s, kind):
+    """A right drone whose law shook was landed: late, it accelerates against the commands of the moment."""
+    dt, figures = 0.01, KINDS[kind]
+    motion, check = Quadrotor(figures, (0.0, 0.0, 0.8), 0.0), DirectionCheck(figures)
+    motion.place((0.0, 0.0, 0.8), 0.0, flying=True)
+    seen = []
+    for tick in range(500):
+        seen.append((motion.position, motion.velocity))
+        x = 0.6 * math.sin(math.tau * hz * tick * dt)
+        if tick * dt >= check.due:
+            check.update(tick * dt, x, 0.0, *seen[max(0, tick - round(late_s / dt))])
+        assert (check.turned, check.against) == (False, False)
+        motion.command((x, 0.0, 0.8 if figures.takes == "position" else 0.0, 0.0))
+        motion.move(dt)
