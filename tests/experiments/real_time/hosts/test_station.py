@@ -142,6 +142,9 @@ def test_silent_station_is_noted_and_its_ssh_ended(tmp_path, monkeypatch, script
 SERVE = "from experiments.real_time.hosts.station import serve; serve(patience_s=0.5)"
 
 
+OWN = f"run{os.getpid()}"  # a run ends all processes of its name, those of other workers too
+
+
 def process_of(run, code="input()", env=None, **options):
     return started("-c", code, env=environment(**{RUN: run}, **(env or {})), **options)
 
@@ -162,8 +165,8 @@ def station(run, **options):
 
 @pytest.mark.system
 def test_it_sweeps_up_its_own_run_only():
-    with process_of("run.lab1") as mine, process_of("run.lab2") as other:
-        with station("run.lab1") as (ask, process):
+    with process_of(f"{OWN}.lab1") as mine, process_of(f"{OWN}.lab2") as other:
+        with station(f"{OWN}.lab1") as (ask, process):
             before = time.time()
             said = ask("clock")
             assert before - 1e-3 <= said.clock <= time.time() + 1e-3
@@ -180,7 +183,7 @@ def test_it_sweeps_up_its_own_run_only():
 def test_station_lists_run_for_a_stop(runtime_folder):
     endpoint = free_endpoint(preferred_port=0)  # as the host reaches it
     desk = changed(own_entry("run", "two", [endpoint], realm="hall", robots={"A": "", "B": ""}), pid=1, born="x")
-    with station("run.lab1", env={"ZENPARK_RUNTIME_DIR": str(runtime_folder)}) as (ask, process):
+    with station(f"{OWN}.lab1", env={"ZENPARK_RUNTIME_DIR": str(runtime_folder)}) as (ask, process):
         ask("clock")
         print(msgspec.json.encode(Question("register", run=desk)).decode(), file=process.stdin, flush=True)
         process.stdout.readline()
@@ -213,8 +216,8 @@ def test_starter_obeys_stops_between_answers(tmp_path, monkeypatch):
 @pytest.mark.mechanism("station: way out on a host")
 @pytest.mark.system
 def test_station_awaits_landing_robots_and_kills_frozen_ones():
-    with process_of("run.lab1") as frozen:
-        with station("run.lab1") as (ask, _):
+    with process_of(f"{OWN}.lab1") as frozen:
+        with station(f"{OWN}.lab1") as (ask, _):
             ask("clock")
             frozen.send_signal(signal.SIGSTOP)
         assert frozen.wait(100.0) == -signal.SIGKILL
@@ -224,9 +227,9 @@ def test_station_awaits_landing_robots_and_kills_frozen_ones():
 @pytest.mark.parametrize("number", [None, signal.SIGKILL, signal.SIGTERM])
 def test_a_preloaded_station_forks_its_robots(number):
     robot_words = ("agent", "-", "KH01", "--lifeline")
-    with station("run.lab3") as (ask, _):
+    with station(f"{OWN}.lab3") as (ask, _):
         ask("preload")
-        with started(*GUARD, *robot_words, env=environment(**{RUN: "run.lab3"})) as robot:
+        with started(*GUARD, *robot_words, env=environment(**{RUN: f"{OWN}.lab3"})) as robot:
             forked = psutil.Process(int(robot.stdout.readline().rpartition(" ")[2]))
             assert forked.pid != robot.pid
             assert zygote.MODULE in forked.parent().cmdline()
