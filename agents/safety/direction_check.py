@@ -6,7 +6,8 @@ axes flies away, faster and faster: it accelerates against its commands. The che
 follows from commanded and measured velocities with the measured one. Their correlation tells the angle as soon as the
 drone wobbles by some centimetres. A push, noise or a lag of another size turns nothing. A wind does for a moment, and
 so do circles by late positions, but not by as much as swapped axes. Commands that shake, and take effect late, make a
-right drone accelerate against those of the moment, to and fro: it does not get far.
+right drone accelerate against those of the moment, to and fro: it does not get far. One that leans against a wind
+seems to accelerate against its commands when it moves gently with the wind: what it commands in vain does not count.
 
 Quiet: all of it.
 """
@@ -30,15 +31,17 @@ ASIDE: Final = (
 )
 AGAINST: Final = 2.0  # [rad] smallest angle of swapped or mirrored axes; late ones on circles show up to 1.1
 AGAINST_S: Final = 0.3  # time for which that counts: a gust is shorter
-AGAINST_M: Final = 0.06  # [m] least motion that was not commanded of late: one that is shaken moves by less
+WIND_S: Final = 3.0  # time constant with which a steady wind is learned
+AGAINST_M: Final = 0.08  # [m] least motion that was not commanded of late: one that is shaken moves by less
 
 
 class DirectionCheck:
     """Commanded and measured accelerations of one drone, seen from above."""
 
     __slots__ = (
-        "against", "angle", "asks", "by_position", "cross", "due", "gain", "inline", "lag", "last", "moved_x",
-        "moved_y", "moves", "opposed_s", "response", "speed", "turned", "velocity", "way_x", "way_y", "x", "y",
+        "against", "angle", "asks", "by_position", "cross", "due", "followed_s", "gain", "inline", "lag", "last",
+        "lean_x", "lean_y", "moved_x", "moved_y", "moves", "opposed_s", "response", "speed", "turned", "velocity",
+        "way_x", "way_y", "x", "y",
     )  # fmt: skip
 
     def __init__(self, kind: Kind) -> None:
@@ -52,7 +55,9 @@ class DirectionCheck:
         """Restart."""
         self.turned = False  # the drone accelerates beside its commands
         self.against, self.opposed_s = False, 0.0  # it accelerates against them; duration so far [s]
-        self.way_x = self.way_y = 0.0  # commanded of late [m]
+        self.lean_x = self.lean_y = 0.0  # velocity that is commanded in vain, against a steady wind [m/s],
+        self.followed_s = 0.0  # learned for this time [s]
+        self.way_x = self.way_y = 0.0  # commanded of late beyond that [m]
         self.moved_x = self.moved_y = 0.0  # measured of late [m]
         self.angle = 0.0  # angle by this comparison [rad]
         self.last = self.due = -inf  # times of the last comparison and of the next [s]
@@ -100,8 +105,12 @@ class DirectionCheck:
     def follow_way(self, since: float, x: float, y: float) -> None:
         """Add the ways that x, y [m/s] commands in `since` [s], and that the drone moves."""
         keep = exp(-since / FORGET_S)
-        self.way_x = keep * self.way_x + since * x
-        self.way_y = keep * self.way_y + since * y
+        self.followed_s += since
+        share = since / min(self.followed_s, WIND_S)
+        self.lean_x += share * (x - self.velocity[0] - self.lean_x)
+        self.lean_y += share * (y - self.velocity[1] - self.lean_y)
+        self.way_x = keep * self.way_x + since * (x - self.lean_x)
+        self.way_y = keep * self.way_y + since * (y - self.lean_y)
         self.moved_x = keep * self.moved_x + since * self.velocity[0]
         self.moved_y = keep * self.moved_y + since * self.velocity[1]
 

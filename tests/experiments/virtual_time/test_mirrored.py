@@ -73,19 +73,35 @@ def test_steady_wind_is_no_fault(radius, period_s, kind):
     assert not log.incidents
 
 
+def assert_right(kind, duration_s, x_at, late_s=0.0, wind=0.0):
+    """Fly a right drone to places `x_at` a time, by late positions and in a wind [m/s²]: no check fails."""
+    dt, figures = 0.01, KINDS[kind]
+    motion, check = Quadrotor(figures, (0.0, 0.0, 0.8), 0.0), DirectionCheck(figures)
+    motion.place((0.0, 0.0, 0.8), 0.0, flying=True)
+    motion.blow((wind, 0.0))
+    seen = []
+    for tick in range(round(duration_s / dt)):
+        seen.append((motion.position, motion.velocity))
+        position, velocity = seen[max(0, tick - round(late_s / dt))]
+        by_position, x = figures.takes == "position", x_at(tick * dt)
+        setpoint = (x, 0.0, 0.8, 0.0) if by_position else (figures.response * (x - position[0]), 0.0, 0.0, 0.0)
+        if tick * dt >= check.due:
+            check.update(tick * dt, setpoint[0], 0.0, position, velocity)
+        assert not check.against
+        motion.command(setpoint)
+        motion.move(dt)
+
+
 @pytest.mark.parametrize(("hz", "late_s"), [(2.0, 0.3), (3.0, 0.2), (4.0, 0.1), (4.0, 0.2), (5.0, 0.1)])
 @drones
 def test_late_shaken_drone_is_not_mirrored(hz, late_s, kind):
     """A right drone whose law shook was landed: late, it accelerates against the commands of the moment."""
-    dt, figures = 0.01, KINDS[kind]
-    motion, check = Quadrotor(figures, (0.0, 0.0, 0.8), 0.0), DirectionCheck(figures)
-    motion.place((0.0, 0.0, 0.8), 0.0, flying=True)
-    seen = []
-    for tick in range(500):
-        seen.append((motion.position, motion.velocity))
-        x = 0.6 * math.sin(math.tau * hz * tick * dt)
-        if tick * dt >= check.due:
-            check.update(tick * dt, x, 0.0, *seen[max(0, tick - round(late_s / dt))])
-        assert (check.turned, check.against) == (False, False)
-        motion.command((x, 0.0, 0.8 if figures.takes == "position" else 0.0, 0.0))
-        motion.move(dt)
+    assert_right(kind, 5.0, lambda t: 0.6 * math.sin(math.tau * hz * t), late_s=late_s)
+
+
+@pytest.mark.parametrize(("way", "period_s"), [(0.2, 4.0), (0.5, 6.0), (1.0, 8.0)])
+@drones
+def test_gentle_way_with_a_wind_is_not_mirrored(way, period_s, kind):
+    """A right drone in the wind of the case `integral` was landed."""
+    wind = 0.8 if kind == "crazyflie" else 0.6
+    assert_right(kind, 15.0, lambda t: way * (1.0 - math.cos(math.tau * max(t - 5.0, 0.0) / period_s)), wind=wind)
