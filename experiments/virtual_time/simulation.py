@@ -7,7 +7,7 @@ is only the loop.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
@@ -409,6 +409,7 @@ class VirtualRun:
             if what in OPTIONAL and np.isnan(columns[what]).all():
                 columns[what] = None
         incidents = [(row, each) for row, robot in enumerate(self.robots) for each in robot.hazards.incidents]
+        declared = chain.from_iterable(law.law.MEASURES for law in self._laws if law is not None)
         return VirtualRunLog(
             names=names,
             seed=self._seed,
@@ -423,7 +424,7 @@ class VirtualRun:
             airborne=conductor.airborne_at - begin,
             ended=self._tick * self.dt - begin,
             memory=self._memory.columns(),
-            measures=self._measures.columns(),
+            measures=self._measures.columns(declared),
             velocities=tuple(law is not None and law.gives_velocity for law in self._laws),
             incidents=tuple(
                 (row, each._replace(time=each.time - begin))
@@ -454,10 +455,11 @@ class LawColumns:
         if count:
             self._parts.append((count, columns))
 
-    def columns(self) -> dict[str, Array]:
-        """(K, N) of numbers, (K, N, k) of tuples; NaN where a robot has no such value."""
+    def columns(self, order: Iterable[str] = ()) -> dict[str, Array]:
+        """(K, N) of numbers, (K, N, k) of tuples; NaN where a robot has no such value. Names in this `order` first."""
         blank = {name: np.full_like(column[0], np.nan) for _, part in self._parts for name, column in part.items()}
         return {
-            name: np.concatenate([part.get(name, np.repeat(none[None], k, axis=0)) for k, part in self._parts])
-            for name, none in blank.items()
+            name: np.concatenate([part.get(name, np.repeat(blank[name][None], k, axis=0)) for k, part in self._parts])
+            for name in dict.fromkeys((*order, *blank))
+            if name in blank
         }

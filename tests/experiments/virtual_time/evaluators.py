@@ -36,6 +36,7 @@ def same(experiment, **options):
     other, ticks = evaluated(experiment, compiled=True, **options)
     for field in fields(plain):
         assert alike(getattr(plain, field.name), getattr(other, field.name)), field.name
+    assert [*plain.measures] == [*other.measures]
     return plain, ticks
 
 
