@@ -75,7 +75,8 @@ def landing_without_router(look: Look, seen: Seen) -> str:
 @rule(OF_ROBOTS, "land after `land_without_position_s` 0.3 s")
 def landing_without_position(look: Look, seen: Seen) -> str:
     word = look.world.readings.get(seen.name, ("",))[0]
-    blind = word in {"nan", "silent"} and seen.phase in (AIRBORNE, RUNNING) and seen.kind.flies and seen.governed
+    aloft = seen.phase in (AIRBORNE, RUNNING) and seen.kind.flies and seen.governed
+    blind = word in {"nan", "silent"} and aloft and not _carried(look, seen)  # `world.patience_s` is longer
     lasted = look.lasting(("blind", seen.name), blind, 1.6)
     return f"no position for {lasted:.1f} s, still {Phase(seen.phase).word}" if lasted and seen.prompt else ""
 
@@ -97,11 +98,14 @@ def silent_landing(look: Look, seen: Seen) -> str:
     return "" if over else f"sends poses while it lands: {life.reason}"
 
 
+def _carried(look: Look, seen: Seen) -> bool:
+    assert look.world.plan is not None
+    return look.world.plan.experiment.robots[seen.name].body == "world"
+
+
 def _misled(look: Look, seen: Seen) -> bool:
     """Whether its body, world or process cannot do what it should; a twin stands still while its loop hangs."""
-    assert look.world.plan is not None
-    carried = look.world.plan.experiment.robots[seen.name].body == "world"
-    if carried and any("world" in {fault.who, *str(fault.size).split()} for fault in look.world.script):
+    if _carried(look, seen) and any("world" in {fault.who, *str(fault.size).split()} for fault in look.world.script):
         return True
     faults = [fault for fault in look.world.script if fault.who == seen.name]
     sizes = [str(fault.size) for fault in faults if fault.kind in {"body", "capture"}]
