@@ -98,7 +98,7 @@ MUTANTS = {
         test_safety.test_lost_neighbour_is_left_out_after_a_second,
     ),
     "twice the time to land": (
-        f"{CONDUCTOR}conductor.py", "time.monotonic() + LAND_S, -inf", "time.monotonic() + 2.0 * LAND_S, -inf",
+        f"{CONDUCTOR}conductor.py", "time.monotonic() + land_s, -inf", "time.monotonic() + 2.0 * land_s, -inf",
         test_hosts.test_frozen_robot_is_ordered_down_then_killed,
     ),
     "hold not lifted": (

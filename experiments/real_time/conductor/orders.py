@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, TypeVar
@@ -144,6 +144,12 @@ def alive(session: zenoh.Session, keys: Keys) -> set[str]:
     return {robot for robot in found if robot is not None}
 
 
+def _stopped(asked: Future[run_registry.StopReport | None] | None) -> set[str]:
+    """Robots that the process of a run has reported as stopped: its router may end before their own words arrive."""
+    report = asked.result() if asked is not None and asked.done() else None
+    return set() if report is None else {*report.stopped}
+
+
 @dataclass
 class EmergencyStop:
     """An emergency stop of one run, or at some routers: over the network, and by the process of the run."""
@@ -182,7 +188,7 @@ class EmergencyStop:
         with ThreadPoolExecutor(1) as pool:  # neither way waits for the other
             asked = None if self.run is None else pool.submit(run_registry.tell, self.run, stop)
             try:
-                self._send(stop)
+                self._send(stop, lambda: _stopped(asked))
             except Exception as error:  # noqa: BLE001 - the others are stopped whatever happens to this one
                 self.failure = error
             report = None if asked is None else asked.result()
@@ -226,7 +232,8 @@ class EmergencyStop:
             self.seen |= self.run.robots.keys()
         self.moving = self.seen - down
 
-    def _send(self, stop: messages.Stop) -> None:
+    def _send(self, stop: messages.Stop, reported: Callable[[], set[str]]) -> None:
+        """Send it until no robot moves, by its own status or as `reported` by the process of the run."""
         keys = Keys(self.realm)
         # a robot that does not answer must not delay the others' stop
         opened = network.open_session(self.endpoints, name="estop", wait_s=2.0, identity=self.identity, gather_s=0.0)
@@ -242,7 +249,7 @@ class EmergencyStop:
             begun = time.monotonic()  # begun after the question who is there, which may take as long
             watch = pubsub.AliveWatch(session, keys.alive("*"))
             while (now := time.monotonic()) < begun + STOP_ANSWER_S and (
-                self.moving or now < begun + LOOK_S or self._awaited(session, begun)
+                self.moving - reported() or now < begun + LOOK_S or self._awaited(session, begun)
             ):
                 urgent.put(payload)
                 time.sleep(STOP_AGAIN_S)

@@ -142,7 +142,7 @@ def stopped(monkeypatch):
         run = changed(run_registry.own_entry("run", "two", ["tcp/127.0.0.1:1"]), robots={"A": "", "B": ""})
         stop = orders.EmergencyStop(run.endpoints, run.realm, run.identity, run)
 
-        def by_network(_stop):
+        def by_network(*_):
             if isinstance(seen, Exception):
                 raise seen
             stop.seen, stop.moving = set(seen), set(moving)
