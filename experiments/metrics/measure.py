@@ -15,6 +15,7 @@ from typing import Any, Final, SupportsFloat
 import msgspec
 import numpy as np
 
+from agents.decision.lifecycle import TOLD_TO_END
 from agents.network.messages import Event
 from agents.safety.hazards import BY_OPERATOR, OVER, QUIET_S, UNRESOLVED, Cause, failed, is_blind
 from experiments.definition import link_conditions
@@ -44,7 +45,7 @@ NAMED_S: Final = 0.05  # [s] shorter holds are not named
 # causes of holds that are not part of an experiment
 HOLDING: Final = (Cause.ORDERED, Cause.POSITION, Cause.ROUTER, Cause.CENTRE, Cause.SUSPENDED)
 CHANGES: Final = {"remove": "removed", "restart": "restarted", "replace": "replaced"}  # orders to the conductor
-LEAVING: Final = "ordered to leave"  # reason of a robot that lands for one of them
+LEAVING: Final = ("ordered to leave", TOLD_TO_END)  # reasons of a robot that lands for one of them
 
 
 def measure(trace: Trace) -> CaseMetrics:
@@ -187,13 +188,16 @@ def _landed_by_conductor(trace: Trace) -> bool:
 def _taken_out(trace: Trace) -> dict[str, str]:
     """Robots that an operator has removed, restarted or replaced in the run, each with a sentence about the first."""
     asked: dict[str, str] = {}
-    found: dict[str, str] = {}
+    left, found = set[str](), dict[str, str]()
     for event in trace.events:
         name = event.source
-        leaves = event.kind == "killed" or (event.kind == "robot" and LEAVING in event.text)
         if event.kind in CHANGES and "on_loss" not in event.text:
             asked[name] = CHANGES[event.kind]
-        elif leaves and name in asked and event.stamp <= trace.time[-1]:
+        elif event.kind == "killed" or (event.kind == "robot" and any(why in event.text for why in LEAVING)):
+            left.add(name)  # maybe before the order is known: others may end its process at the same time
+        else:
+            continue
+        if name in asked and name in left and event.stamp <= trace.time[-1]:
             found.setdefault(name, f"{name} was {asked[name]} {BY_OPERATOR} at {event.stamp:.1f} s")
     return found
 

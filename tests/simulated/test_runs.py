@@ -62,6 +62,9 @@ ROWS = {
     "emergency": Run(1, "emergency stop by operator: zenpark estop", (Fault(1.0, "estop"),)),
     "held": Run(3, "B was held by an operator for 0.7 of 3 s", (*order(1.0, "hold"), *order(1.7, "resume"))),
     "removed": Run(3, "B was removed by an operator at 1.", order(1.0, "remove"), experiment=TRIO),
+    "removed_and_ended": Run(
+        3, "B was removed by an operator at 1.", (*order(1.0, "remove"), Fault(1.011, "term", "B")), experiment=TRIO
+    ),
     "restarted": Run(3, "B was restarted by an operator at 1.", order(1.0, "restart")),
     "replaced": Run(3, "B was replaced by an operator at 1.", order(1.0, "replace --body twin")),
     "interrupted": Run(130, "Interrupted after 1.0 s of 3 s", (Fault(1.0, "interrupt"),)),
