@@ -244,7 +244,7 @@ class Runtime:
             if self._cut_off:  # most stops come during that sleep
                 self._yield_after_stop()
             if ticks.next >= self._router_due:  # a check of the router costs as much as a law
-                self._look_for_router(ticks.next)
+                self._look_for_router(max(ticks.next, ticks.elapsed()))
             if self._descent.await_ownership():
                 continue
             missed = ticks.begin()
