@@ -299,7 +299,7 @@ class RealStage:
             while expected and time.monotonic() < limit and differences(list(self._events()), expected):
                 pause.wait(0.1)
             pause.wait(QUIET_S)
-            return list(self._events())  # before the end of all: clients notice that of the router
+            return list(self._events())  # clients notice the end of the router, which follows
 
     def _await(self, count: int) -> None:
         for _ in range(count):

@@ -36,7 +36,7 @@ Frame,Time (Seconds),X,Y,Z,W,X,Y,Z,,X,X
 """
 NAMES = [f"/CF0{n}/pose/position/{axis}" for n in (1, 2) for axis in "xy"]
 RUN = "case,time,robot,x,y,yaw\na,0,R1,0,0,0\na,0,R2,1,0,0\nb,1,R1,1,0,0\nb,1,R2,2,0,0\n"
-TOPICS = f"time,{','.join(NAMES)}\n0,0,1,5,6\n1,1,1,6,6\n"  # as PlotJuggler writes them
+TOPICS = f"time,{','.join(NAMES)}\n0,0,1,5,6\n1,1,1,6,6\n"  # columns as PlotJuggler names them
 
 
 QTM = """NO_OF_FRAMES	3

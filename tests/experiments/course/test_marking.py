@@ -243,7 +243,7 @@ SLEEPS = (
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL, signal.SIGINT])
 def test_marking_that_ends_leaves_no_process(course, tmp_path, number):
-    name = f"nap-{os.getpid()}-{number}"  # at most 15 letters
+    name = f"nap-{os.getpid()}-{number}"  # an interface has at most 15 letters
     write({"meet.toml": FILE, "meet.py": LAW.replace(LINE, SLEEPS % name)}, tmp_path / "sleeps")
     words = ("mark", tmp_path / "sleeps", "--from", course, "--seeds", 1)
     with started(*GUARD, *words, env=environment(TMPDIR=str(tmp_path))) as marking:

@@ -138,7 +138,7 @@ def test_other_files_are_refused_with_their_line(text, said, links, tmp_path):
     assert problem.place == f"{tmp_path / 'task.toml'}:8:18"
 
 
-YED = '<y:NodeLabel x="1.0">{}<y:LabelModel>\n</y:LabelModel></y:NodeLabel>'  # as yEd draws it
+YED = '<y:NodeLabel x="1.0">{}<y:LabelModel>\n</y:LabelModel></y:NodeLabel>'  # a label of yEd
 LABELLED = '<node id="n0"><data key="d">{}</data></node><node id="n1"><data key="d">{}</data></node>'
 
 

@@ -86,7 +86,7 @@ def test_others_read_it(path):
 
 def nanoseconds(*at):
     """Time of the run as a file has it, exact: `playback` reads the same number back."""
-    return round(Fraction(reduce(add, at, rec.START)) * 10**9)  # from 3.12 on, sum corrects its rounding
+    return round(Fraction(reduce(add, at, rec.START)) * 10**9)  # sum corrects its rounding from Python 3.12 on
 
 
 def test_a_recording_is_never_overwritten(path, tmp_path):

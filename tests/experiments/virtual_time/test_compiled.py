@@ -379,7 +379,7 @@ def test_take_off_and_common_start_are_compiled():
     for kind in ({"kind": "khepera4"}, {"kind": "crazyflie", "hover": 0.5}):
         robots = {"A": RobotTable(**kind, start=[0.0, 0.0]), "B": RobotTable(**kind, start=[0.5, 0.0])}
         log, ticks = same(follower(robots=robots, formation=Formation(links={"A > B": 0.5, "B > A": 0.5})))
-        assert ticks >= (1.0 - log.time[0] / 4.0) * log.ticks - 5  # of 4 s
+        assert ticks >= (1.0 - log.time[0] / 4.0) * log.ticks - 5  # the flight lasts 4 s
 
 
 def test_law_outside_of_the_subset_is_flown_plain():
