@@ -18,7 +18,7 @@ MOST, LEAST = 12, 60  # modules of a folder; lines of a module that only one oth
 MOST_WORDS = 8  # of a test's name
 # Each line imports from lines above it and within each of its own folders.
 ORDER = """
-agents.errors agents.vectors
+agents.errors agents.fields agents.vectors
 agents.clock agents.ticks agents.user_folder
 agents.formation agents.network
 agents.plugins

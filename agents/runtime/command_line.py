@@ -11,12 +11,13 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from types import FrameType
-from typing import Annotated, Any, TypeVar, get_args, get_origin
+from typing import Annotated, Any, TypeVar, get_origin
 
 import msgspec
 from msgspec import Meta
 
 from agents.errors import ExplainedError
+from agents.fields import bare, fields_of
 from agents.network.endpoints import DEFAULT_ENDPOINT
 from agents.network.keys import Keys
 from agents.network.lab import secured
@@ -88,9 +89,8 @@ def parser_of(prog: str, kind: type[msgspec.Struct]) -> argparse.ArgumentParser:
     Description and metavar are those of `msgspec.Meta(description=..., title=...)`.
     """
     parser = argparse.ArgumentParser(prog=prog, description=(kind.__doc__ or "").partition("\n")[0])
-    for field in msgspec.structs.fields(kind):
-        annotated = get_origin(field.type) is Annotated
-        plain, meta = get_args(field.type)[:2] if annotated else (field.type, Meta())
+    for name, field in fields_of(kind).items():
+        plain, meta = bare(field.type)
         options: dict[str, Any] = {"help": meta.description}
         if plain is bool:
             options["action"] = "store_true"
@@ -99,9 +99,9 @@ def parser_of(prog: str, kind: type[msgspec.Struct]) -> argparse.ArgumentParser:
         if get_origin(plain) is list:
             options |= {"nargs": "+"} if field.required else {"action": "append"}
         if field.required:
-            parser.add_argument(field.encode_name, **options)
+            parser.add_argument(name, **options)
         else:
-            parser.add_argument(f"--{field.encode_name}", dest=field.encode_name, default=argparse.SUPPRESS, **options)
+            parser.add_argument(f"--{name}", dest=name, default=argparse.SUPPRESS, **options)
     return parser
 
 

@@ -7,11 +7,11 @@ from collections.abc import Iterator
 from math import degrees
 from typing import Final
 
-import msgspec
 import numpy as np
 
 from agents.body.kinds import KINDS
 from agents.errors import join_names
+from agents.fields import fields_of
 from agents.network.keys import Keys
 from agents.plugins import registry
 from agents.safety.setpoint_filter import OUTSIDE_M
@@ -34,7 +34,7 @@ def safety(analysis: Analysis) -> Iterator[Finding]:
     if chosen.cut_beyond_m <= OUTSIDE_M:
         message = f"motors are cut {chosen.cut_beyond_m:g} m outside the arena, but drones land {OUTSIDE_M:g} m outside"
         yield Finding("warning", "cut-outside", message, f"raise it above {OUTSIDE_M:g}", ("safety", "cut_beyond_m"))
-    for each in msgspec.structs.fields(chosen):
+    for each in fields_of(type(chosen)).values():
         value, usual = getattr(chosen, each.name), each.default
         if isinstance(usual, float) and value >= LOOSE * usual:
             message = f"{each.name} is {value:g}, {value / usual:.0f} times the usual {usual:g}: it has no effect"

@@ -23,6 +23,7 @@ from typing import Any, Final, NamedTuple
 
 import msgspec
 
+from agents.fields import fields_of
 from agents.formation.link import Link
 from agents.plugins import files, registry
 from agents.plugins.calls import Watched, wrong
@@ -218,8 +219,8 @@ _TRIGGER: Final = {"fires": _fires}
 
 def _changed(stand_in: Any, given: Mapping[str, Any]) -> dict[str, Any]:  # noqa: ANN401 - a class
     """Parameters that are not the solution's defaults: a group may write others into its class."""
-    fields = {each.encode_name: each.default for each in msgspec.structs.fields(stand_in)}
-    return {name: value for name, value in given.items() if value != fields[name]}
+    fields = fields_of(stand_in)
+    return {name: value for name, value in given.items() if value != fields[name].default}
 
 
 def _imports(file: Path) -> set[str]:

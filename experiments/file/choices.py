@@ -6,13 +6,13 @@ import importlib
 import pathlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cache
 from inspect import getfile
 from typing import Any, Final
 
 import msgspec
 
 from agents.body.kinds import KINDS
+from agents.fields import default_of, fields_of
 from agents.plugins import files, registry
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
@@ -113,14 +113,14 @@ def tables(value: Any, path: Path = (), *, uniform: bool = False) -> Any:  # noq
     """
     if uniform and isinstance(value, str | dict) and (group := group_of(path)) is not None:
         kind, given = registry.split(value)
-        defaults = {name: _of_default(field) for name, field in fields_of(struct_of(group, kind)).items()}
+        defaults = {name: default_of(field) for name, field in fields_of(struct_of(group, kind)).items()}
         return [kind, {key: _numbers(each) for key, each in given.items() if each != defaults[key]}]
     if isinstance(value, msgspec.Struct):
         found = {}
         for name, field_ in fields_of(type(value)).items():
             inside = (*path, name)
             each = tables(getattr(value, field_.name), inside, uniform=uniform)
-            if field_.required or each != tables(_of_default(field_), inside, uniform=uniform):
+            if field_.required or each != tables(default_of(field_), inside, uniform=uniform):
                 found[name] = each
         return found
     if isinstance(value, dict):
@@ -128,16 +128,6 @@ def tables(value: Any, path: Path = (), *, uniform: bool = False) -> Any:  # noq
     if isinstance(value, list | tuple):
         return [tables(each, (*path, number), uniform=uniform) for number, each in enumerate(value)]
     return value
-
-
-@cache
-def fields_of(struct: type[msgspec.Struct]) -> Mapping[str, msgspec.structs.FieldInfo]:
-    """Fields by their names in a file. Cached: resolving annotations takes longer than checking a table."""
-    return {field.encode_name: field for field in msgspec.structs.fields(struct)}
-
-
-def _of_default(field: msgspec.structs.FieldInfo) -> Any:  # noqa: ANN401 - any value of a file
-    return field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
 
 
 def _numbers(value: Any) -> Any:  # noqa: ANN401 - a parameter of a plug-in

@@ -17,11 +17,12 @@ from typing import Any, Final
 import msgspec
 
 from agents.body.kinds import KINDS, Kind
+from agents.fields import description
 from agents.plugins import files, registry
 from agents.plugins.registry import split
 from experiments.catalogue.index import FOLDER
 from experiments.definition.experiment import Experiment
-from experiments.file.choices import PLACES, fields_of, group_of, struct_of
+from experiments.file.choices import PLACES, group_of, struct_of
 from experiments.file.json_schema import CASE, described, map_children, table_of
 
 NONE: Final[Mapping[str, object]] = {}
@@ -126,17 +127,10 @@ def unit(asked: str, experiment: Experiment) -> str:
         choice: Any = experiment
         for step in steps[:-1]:
             choice = getattr(choice, str(step)) if isinstance(choice, msgspec.Struct) else choice[step]
-        texts = [_description(struct_of(group, split(choice)[0]), str(steps[-1]))]
+        texts = [description(struct_of(group, split(choice)[0]), str(steps[-1]))]
     found = [re.search(r"\[([^\]\s]+)\]", text) for text in texts]
     units = {each[1] if each and each[1] != "1" else "" for each in found}
     return units.pop() if len(units) == 1 else ""
-
-
-def _description(struct: type[msgspec.Struct], key: str) -> str:
-    """Text of a field; empty without one."""
-    known = fields_of(struct).get(key)
-    metas = getattr(known.type, "__metadata__", ()) if known else ()
-    return next((each.description for each in metas if isinstance(each, msgspec.Meta) and each.description), "")
 
 
 def containing(asked: str) -> list[Entry]:

@@ -10,14 +10,15 @@ import re
 import types
 from collections.abc import Iterator, Mapping, Sequence
 from math import radians
-from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
+from typing import Any, Final, Literal, Union, get_args, get_origin
 
 import msgspec
 
 from agents.errors import did_you_mean
+from agents.fields import bare, fields_of, structs_in
 from agents.plugins import files, registry
 from experiments.definition.experiment import LONGEST_NAME, Experiment
-from experiments.file.choices import fields_of, group_of, parameters, struct_of
+from experiments.file.choices import group_of, parameters, struct_of
 from experiments.file.problems import DocumentError, Fault, Path, Problem, key_name, refusal, shown
 
 _REMEDY: Final = {  # remedy for a missing key
@@ -70,9 +71,10 @@ def _value(value: object, annotation: object, path: Path, note: str) -> list[Fau
     group = group_of(path)
     if group is not None and isinstance(value, str | dict):
         return _choice(value, group, path)
-    plain, note = _plain(annotation, note)
+    plain, meta = bare(annotation)
+    note = meta.description or note
     inner: list[Fault] = []
-    if _is_struct(plain):
+    if structs_in(plain) == [plain]:
         return table_faults(value, plain, path) if isinstance(value, dict) else [_no_table(value, path)]
     if get_origin(plain) is dict:
         if not isinstance(value, dict):
@@ -89,7 +91,7 @@ def _value(value: object, annotation: object, path: Path, note: str) -> list[Fau
         for number, each in enumerate(value):
             inner += _value(each, get_args(plain)[0], (*path, number), note)
     elif get_origin(plain) in _UNIONS and isinstance(value, dict):
-        tables = [each for each in get_args(plain) if _is_struct(each)]
+        tables = structs_in(plain)
         if len(tables) == 1 or (tables and tables[0].__struct_config__.tag_field is not None):
             return _one_table(value, tables, path)
     return inner or _judged(value, annotation, path, note)
@@ -117,8 +119,7 @@ def table_faults(
                 value[name], field.type, (*path, name), f"left out: {shown(field.default)}" if plain else ""
             )
         elif field.required and name not in guessed:
-            _, note = _plain(field.type, "")
-            hint = _REMEDY.get(name) or f"add {name} = ... ({note})"
+            hint = _REMEDY.get(name) or f"add {name} = ... ({bare(field.type)[1].description or ''})"
             found.append(Fault(path, f"'{name}' is missing{_place_in_file(path)}", hint))
     return found or _own_checks(value, struct, path)
 
@@ -205,7 +206,7 @@ def _judged(value: object, annotation: object, path: Path, note: str) -> list[Fa
 
 def _in_words(text: str, value: object, annotation: object, path: Path, note: str) -> Fault:
     name = key_name(path)
-    plain, _ = _plain(annotation, note)
+    plain, _ = bare(annotation)
     literals = [part for part in (plain, *get_args(plain)) if get_origin(part) is Literal]
     if literals and (literals[0] is plain or (isinstance(value, str) and get_origin(plain) in _UNIONS)):
         words = [str(word) for part in literals for word in get_args(part)]
@@ -219,7 +220,6 @@ def _in_words(text: str, value: object, annotation: object, path: Path, note: st
         limit = " of letters, digits and _ that begins with a letter"
     if isinstance(value, bool) or not isinstance(value, list | dict):
         limit += f", not {shown(value)}"
-    tables = [part for part in (plain, *get_args(plain)) if _is_struct(part)]
     if path[:2] == ("formation", "links"):
         return Fault(path, f"'{name}' must be {' or '.join(wanted)}{limit}", LINK.format(name=name))
     if path[-2:-1] == ("shape",) and isinstance(value, list):
@@ -227,9 +227,9 @@ def _in_words(text: str, value: object, annotation: object, path: Path, note: st
         return Fault(path, message, f"write {name} = [0.5, 0.0]")
     if isinstance(value, str) and {_WORDS["float"], _WORDS["int"], _WORDS["array"]} & {*wanted}:
         note = _number_meant(value, name) or note
-    for table in tables[:1] if not isinstance(value, dict) else []:
-        fields = msgspec.structs.fields(table)
-        needed = [field.encode_name for field in fields if field.required] or [fields[0].encode_name]
+    for table in structs_in(plain)[:1] if not isinstance(value, dict) else []:
+        fields = fields_of(table)
+        needed = [name for name, field in fields.items() if field.required] or [next(iter(fields))]
         form = ", ".join(f"{field} = ..." for field in needed)
         note = f"write {name} = {{ {form} }}: {note}" if note else f"write {name} = {{ {form} }}"
     return Fault(path, f"'{name}' must be {' or '.join(wanted)}{limit}", note)
@@ -262,19 +262,6 @@ def _no_table(value: object, path: Path) -> Fault:
     if isinstance(value, list) and path == ("robots",):
         return Fault(path, "'robots' must be tables with names", "write [robots.KH01], one header for each robot")
     return Fault(path, f"'{key_name(path)}' must be a table, not {shown(value)}", f"write [{header}] above its keys")
-
-
-def _plain(annotation: object, note: str) -> tuple[Any, str]:
-    """An annotation without its constraints, and its description; that of the innermost wins."""
-    while get_origin(annotation) is Annotated:
-        for meta in get_args(annotation)[1:]:
-            note = getattr(meta, "description", None) or note
-        annotation = get_args(annotation)[0]
-    return annotation, note
-
-
-def _is_struct(annotation: object) -> bool:
-    return isinstance(annotation, type) and issubclass(annotation, msgspec.Struct)
 
 
 def _place_in_file(path: Path) -> str:

@@ -16,6 +16,7 @@ import numpy as np
 import zenoh
 
 from agents.clock import Clock
+from agents.fields import description
 from agents.network import endpoints as topology
 from agents.network import lab, messages, pubsub
 from agents.network.keys import Keys
@@ -314,8 +315,5 @@ def parameters(stage: SceneModel) -> list[Parameter]:
 
 def _unit(owner: msgspec.Struct, name: str) -> str:
     """Unit of a field, as its description states it in brackets."""
-    kind = type(owner)
-    _, definitions = msgspec.json.schema_components([kind], ref_template="{name}")
-    text = definitions[kind.__name__]["properties"].get(name, {}).get("description", "")
-    found = re.search(r"\[([^\]]+)\]", text)
+    found = re.search(r"\[([^\]]+)\]", description(type(owner), name))
     return "" if found is None else found[1]
