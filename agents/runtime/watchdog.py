@@ -27,7 +27,7 @@ class Watchdog:
     """Watches a loop that calls `beat` on every turn, from `start` to `end`, repeatedly if wanted.
 
     After `silence_s` without a beat it orders the body to land and raises the alarm, and after `down_s` more it cuts
-    the motors and ends the process. Each call has a thread of its own: it may hang as the loop does.
+    the motors and ends the process. Each call, of each row, has a thread of its own: it may hang as the loop does.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class Watchdog:
                 self.call_for_help(self.tripped)
             if looked >= again and not displaced:
                 again = looked + AGAIN_S
-                self._call_in_thread("land", lambda: self._body.land(self._rows))
+                self._order_each("land", self._body.land)
             if looked - hung > self.down_s:
                 self._abort()
                 return
@@ -108,10 +108,16 @@ class Watchdog:
     def _abort(self) -> None:
         """Cuts the motors and ends the process; the watchdog of the device and the launcher do the rest."""
         if not self._displaced():
-            self._call_in_thread("stop", lambda: self._body.stop(self._rows))
-            self._at_work["stop"].join(CUT_S)
+            self._order_each("stop", self._body.stop)
+            limit = time.monotonic() + CUT_S
+            for row in self._rows:
+                self._at_work[f"stop {row}"].join(max(0.0, limit - time.monotonic()))
         if not self._over.wait(CUT_S):  # time for messages to leave the process
             self._end(HUNG)
+
+    def _order_each(self, what: str, order: Callable[[Sequence[int]], object]) -> None:
+        for row in self._rows:
+            self._call_in_thread(f"{what} {row}", partial(order, (row,)))
 
     def _call_in_thread(self, what: str, call: Callable[[], object]) -> None:
         """Makes a call in a thread of its own, unless the last call of that name still runs."""

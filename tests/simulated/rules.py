@@ -104,13 +104,14 @@ def _carried(look: Look, seen: Seen) -> bool:
 
 
 def _misled(look: Look, seen: Seen) -> bool:
-    """Whether its body, world or process cannot do what it should; a twin stands still while its loop hangs."""
+    """Whether its body, world or process cannot do what it should; a twin stands still while its process hangs."""
     if _carried(look, seen) and any("world" in {fault.who, *str(fault.size).split()} for fault in look.world.script):
         return True
     faults = [fault for fault in look.world.script if fault.who == seen.name]
     sizes = [str(fault.size) for fault in faults if fault.kind in {"body", "capture"}]
     wrong = any(word in size for size in sizes for word in ("motors", "stuck", "adrift", "aloft"))
-    return wrong or any(fault.kind == "hang" for fault in faults) or not seen.prompt
+    still = not _carried(look, seen) and look.spoiled({"hang"}, seen.name)
+    return wrong or still or not seen.prompt
 
 
 @rule(OF_ROBOTS, "its landing makes no progress for this time")
@@ -258,7 +259,12 @@ def contact(look: Look, one: Seen, other: Seen) -> str:
     p, q = one.motion.position, other.motion.position
     beside = hypot(p[0] - q[0], p[1] - q[1]) < one.kind.radius + other.kind.radius
     level = abs(p[2] - q[2]) < max(one.kind.height, other.kind.height)
-    return f"touches {other.name}, {p} {q}" if beside and level else ""
+    excused = ("excused", one.name, other.name)  # they met while the body of one followed its last command
+    if not (beside and level):
+        look.since.pop(excused, None)
+    elif not (one.governed and other.governed):
+        look.since[excused] = look.now
+    return f"touches {other.name}, {p} {q}" if beside and level and excused not in look.since else ""
 
 
 def _second_voice(look: Look, name: str, process: Process) -> str:

@@ -8,7 +8,7 @@ import pytest
 from tests.cases import mostly_slow
 from tests.simulated.faults import Fault
 from tests.simulated.laboratory import fly
-from tests.simulated.small import AT_S, DRONE, TICK_S, TRIO, body, hall
+from tests.simulated.small import AT_S, DRONE, PAIR, TICK_S, TRIO, body, hall
 from tests.simulated.world import LOOK_S
 
 FLIER, WHEELS = "crazyflie", "khepera4"
@@ -122,6 +122,20 @@ def test_suspended_robot_holds_until_it_hears():
     assert end.startswith("over: ")
 
 
+def test_robot_on_wheels_drives_on_while_suspended():
+    """Seed 120907: after it woke it met another one, before it knew whether its body was its own."""
+    asleep = Fault(AT_S, "pause", "A", lasts=4.3)
+    world = PAIR.replace("-0.5, 0.0]", '-0.19, 0.0], body = "world"').replace(
+        '"A - B" = 0.9 }', '"B > A" = 0.1 }\nleader = "B"'
+    )
+    flight = fly(world, asleep, settings=["duration_s=7", 'avoidance.kind="barrier"'])
+    robot, woken = flight.robots["A"], AT_S + asleep.lasts
+    met = next(each.t for each in robot.samples if each.position[0] > 0.5 - 2.0 * 0.07)
+    stands = next(each.t for each in robot.samples if each.t > woken and each.velocity[0] < 0.01)
+    assert woken < met < stands < woken + 0.7
+    assert flight.violations == []
+
+
 @pytest.mark.parametrize("since", ["ready", "landing"])
 def test_computer_that_slept_lands_its_robots(since):
     """Its conductor killed the processes of robots in mid-air: their time to land was over when it went on."""
@@ -233,6 +247,20 @@ def test_hanging_loop_is_landed_then_cut():
     assert AT_S + 0.5 + 12.5 < process.ended < AT_S + 0.7 + 12.5 + 1.0  # 2.5 m at 0.2 m/s
     assert process.code == 70
     assert flight.robots["C"].off(after=process.ended) == process.ended
+
+
+@pytest.mark.parametrize("body", ["world", "twin"])
+def test_hanging_loop_lands_all_its_robots(body):
+    """Seeds 130158 and 130909: a twin in the process stands still with the loop, on the way down too."""
+    both = DRONE.replace('"khepera4", ', '"crazyflie", hover = 0.8, ').replace(
+        "0.8", f'0.8, body = "{body}", process = "g"'
+    )
+    flight = fly(both, Fault(0.4, "hang", "A", 12.0, since="landing"))
+    begun = flight.happened("phase", text="landing")[0].t + 0.4
+    for robot in flight.robots.values():
+        assert begun + 0.5 <= next(t for t, _ in robot.commands if t > begun + 0.1) < begun + 0.7
+        assert (robot.off() < begun + 2.0) == (body == "world")
+    assert flight.violations == []
 
 
 def test_body_that_cannot_be_read_is_landed():

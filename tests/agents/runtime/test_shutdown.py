@@ -172,7 +172,9 @@ def test_stop_between_ticks_yields_the_processor(monkeypatch):
 
 
 class Kennel(ManualClock):
-    """A watchdog on a clock of its own, and its body, which writes down what it is told, and hangs in what is `stuck`.
+    """A watchdog on a clock of its own, and its body of two rows, which writes down what row 1 is told.
+
+    Row 0 hangs in what is `stuck`.
 
     `watch` lets it look at its loop as often as `life` yields; what is not stuck is done before the next look.
     """
@@ -187,9 +189,9 @@ class Kennel(ManualClock):
         self.dog._over = self  # type: ignore[assignment]
 
     def take(self, what: str, rows: Sequence[int]) -> None:
-        assert rows == (0, 1)
-        self.orders.append(what)
-        if self.stuck == what:
+        if rows == (1,):
+            self.orders.append(what)
+        elif self.stuck == what:
             self.never.wait(30.0)
 
     def watch(self, life: Iterator[None]) -> None:
@@ -201,10 +203,8 @@ class Kennel(ManualClock):
 
     def wait(self, seconds: float) -> bool:
         for what, thread in self.dog._at_work.items():
-            if what != self.stuck:
+            if what != f"{self.stuck} 0":
                 thread.join()
-            else:
-                until(lambda: self.stuck in self.orders, "it hangs")
         self.sleep(seconds)
         return next(self.life, self) is self
 
@@ -233,7 +233,7 @@ def test_hanging_loop_is_landed_and_may_recover(monkeypatch):
 def test_endless_hang_is_cut_and_ended(stuck, monkeypatch):
     kennel = Kennel(monkeypatch, down_s=0.8, stuck=stuck)
     kennel.watch(repeat(None))
-    assert (kennel.ends, kennel.orders) == ([HUNG], ["land"] * (1 if stuck == "land" else 2) + ["stop"])
+    assert (kennel.ends, kennel.orders) == ([HUNG], ["land", "land", "stop"])
 
 
 FROZEN = """
@@ -245,7 +245,7 @@ def say(text):
 class Body:
     def land(self, rows): say("landed")
     stop = land
-dog = Watchdog(Body(), None, alarm=say, silence_s=0.5, down_s=0.1)
+dog = Watchdog(Body(), (0,), alarm=say, silence_s=0.5, down_s=0.1)
 dog.start()
 print("runs", flush=True)
 pause, left = threading.Event(), 80
