@@ -166,9 +166,9 @@ def failures(trace: Trace, known: Sequence[float]) -> tuple[str, ...]:
             if event.text.startswith(UNRESOLVED) and event.source in blind:
                 begin = blind[event.source]
                 what = f"{begin.text.removeprefix('hold: ')}, until the end"
-            found[event.source] = f"{event.source} at {max(begin.stamp, 0.0):.1f} s: {what}"
+            found[event.source] = f"{event.source} {_moment(begin)}: {what}"
         elif event.text.startswith("cut: ") and "cut: " not in found.get(event.source, "cut: "):
-            found[event.source] += f"; at {max(event.stamp, 0.0):.1f} s {event.text}"
+            found[event.source] += f"; {_moment(event)} {event.text}"
     taken_out = _taken_out(trace)
     for name, share in zip(trace.robots, known, strict=True):
         if share < PRESENT and name not in taken_out:
@@ -177,6 +177,11 @@ def failures(trace: Trace, known: Sequence[float]) -> tuple[str, ...]:
         planned = trace.plan.experiment.duration_s
         found[""] = f"the recording breaks off after {trace.time[-1]:.1f} s of {planned:g} s"
     return tuple(found.values())
+
+
+def _moment(event: Event) -> str:
+    """Time of an event, in words."""
+    return f"at {abs(event.stamp):.1f} s" if event.stamp > -0.05 else f"{-event.stamp:.1f} s before the start"
 
 
 def _landed_by_conductor(trace: Trace) -> bool:
@@ -198,7 +203,7 @@ def _taken_out(trace: Trace) -> dict[str, str]:
         else:
             continue
         if name in asked and name in left and event.stamp <= trace.time[-1]:
-            found.setdefault(name, f"{name} was {asked[name]} {BY_OPERATOR} at {event.stamp:.1f} s")
+            found.setdefault(name, f"{name} was {asked[name]} {BY_OPERATOR} {_moment(event)}")
     return found
 
 
@@ -267,7 +272,7 @@ def _redirected(trace: Trace) -> list[str]:
     found: dict[str, str] = {}
     for event in trace.events:
         if event.kind == "hazard" and event.text.startswith("warn: ") and event.text.endswith(BY_OPERATOR):
-            sentence = f"{event.source} {event.text.removeprefix('warn: ')} at {max(event.stamp, 0.0):.1f} s"
+            sentence = f"{event.source} {event.text.removeprefix('warn: ')} {_moment(event)}"
             found.setdefault(event.source, sentence)
     return [*found.values()]
 

@@ -113,7 +113,7 @@ def test_ctrl_c_lands_the_robot_that_hops(preflight, tmp_path):
         process.send_signal(signal.SIGINT)
 
     hop = preflight(TWO.replace("BODY", "twin"), "--hop", code=130, meanwhile=interrupt)[0]["hop"]
-    assert (hop["verdict"], hop["found"]) == ("unknown", "interrupted; it is down")
+    assert (hop["verdict"], hop["found"]) == ("unknown", "interrupted; its motors are off")
     assert log.read_text().rstrip().splitlines()[-1].startswith("CF01: done")
 
 

@@ -151,7 +151,8 @@ def preflight(
         print(text)
     else:
         _print_checks(found)
-        verdict = f"red: {', '.join(red)}" if red else "interrupted" if ended else "nothing is red"
+        stopped = "interrupted" if ended else "ended by an emergency stop" if emergency else ""
+        verdict = f"red: {', '.join(red)}" if red else stopped or "nothing is red"
         print(f"\n{verdict}; {folder / 'preflight.json'}, logs: {folder / 'logs'}")
     if emergency:
         print(f"zenpark: {emergency.words}", file=sys.stderr)

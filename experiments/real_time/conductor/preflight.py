@@ -185,7 +185,7 @@ class Inspector(CaseRun):
             if not why:
                 self._phase(f"{name}: {check}")
                 made = judge()
-                why = "interrupted; it is down" if self._context.ended() else ""
+                why = f"interrupted; {self._at_end(name)}" if self._context.ended() else ""
                 red = made.verdict == "bad"
             yield Check(check, "unknown", why) if why else made
 
@@ -324,6 +324,13 @@ class Inspector(CaseRun):
 
     def _order(self, name: str, order: messages.Order) -> messages.Reply:
         return self._view.order([name], order)[name]
+
+    def _at_end(self, name: str) -> str:
+        """What a robot that was moved has said last of its motors."""
+        self._update()
+        seen = self._robots[name]
+        off = seen.reached("done") and UNANSWERED not in (seen.status.body if seen.status else "")
+        return "its motors are off" if off else f"look at it: {self._reason(name)}"
 
     def _reason(self, name: str) -> str:
         status = self._robots[name].status

@@ -338,6 +338,11 @@ def test_robots_that_failed_their_part_are_named_first(events, failure):
     assert first.text == f"Failed in only: F at 3.0 s: {failure}." or not failure
 
 
+def test_what_failed_before_the_start_says_so():
+    made = (Event(-0.4, "hazard", "F", CAME_DOWN),)
+    assert measure(replace(DECAY, events=made)).failures == (f"F 0.4 s before the start: {CAME_DOWN}",)
+
+
 LOST = "its own position is lost"
 BLIND = f"hold: {LOST}: the last is 0.51 s old"
 
