@@ -117,7 +117,7 @@ class Pool:
             thread.join()
             return found[0]
 
-        return SimpleNamespace(result=result)
+        return SimpleNamespace(result=result, done=lambda: not thread.is_alive())
 
 
 @contextlib.contextmanager

@@ -53,7 +53,7 @@ ROWS = {
     "landed": Run(1, "B landed after 1.0 of 3 s: ordered to land by an operator", order(1.0, "land")),
     "stopped": Run(1, "B landed after 1.0 of 3 s: ordered to stop by an operator", order(1.0, "stop")),
     "all_landed": Run(1, "landed after 1.0 of 3 s", (*order(1.0, "land"), *order(1.0, "land", "A"))),
-    "left_out": Run(1, "B at 0.0 s: takes no part: it is not ready: no position of its own", (ABSENT,), GO_ON),
+    "left_out": Run(1, "before the start: takes no part: it is not ready: no position of its own", (ABSENT,), GO_ON),
     "not_ready": Run(2, "A, B: not ready after 2 s; nothing has moved", (ABSENT,), (NEVER, "start.deadline_s=2")),
     "early_by_seconds": Run(1, "before the common start", order(0.2, "start", "A", since="ready"), experiment=DRONE),
     "early": Run(3, "did not begin together", order(-0.2, "start")),

@@ -307,6 +307,8 @@ def test_emergency_stop_ends_the_run():
     assert flight.robots["C"].phases[-1].reason.startswith("emergency stop")
     assert flight.code == 1
     assert "zenpark: emergency stop by operator: zenpark estop" in flight.output
+    answer = flight.answers[0]
+    assert (answer.code, answer.output.partition(" (")[0]) == (0, "stopped: A, C"), "by network and the run's process"
     assert not [each for each in flight.processes if each.name.startswith("second-")]
 
 

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 LOOK_S = 0.05  # period of samples and rules
 END_S = 0.05  # time after the end of the last process
-OUTSIDE = ("operator", "capture", "second ")  # processes that no run has started
+OUTSIDE = ("capture", "second ")  # processes that no run has started, and that end by themselves or never
 
 _world: World | None = None
 
