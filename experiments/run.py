@@ -145,7 +145,6 @@ def _column(values: Sequence[Any]) -> list[Any]:
 
 
 Progress = Callable[[str, int, int], None]  # case, simulated seconds, seconds in all
-Watch = Callable[[str, Plan], Callable[[simulation.Snapshot], object] | None]  # watcher of a case
 
 
 def simulate(
@@ -236,13 +235,12 @@ def simulate_seeds(
     folder: str | Path | None = None,
     processes: int | None = None,
     progress: Progress = lambda *_: None,
-    watch: Watch = lambda *_: None,
 ) -> list[Run]:
     """As `simulate`, once for each seed; recordings are made of the first seed only.
 
     Many seeds are shared between processes (as many as this machine has cores), which import the script: there under
-    `if __name__ == "__main__"`. `progress` is called repeatedly. `watch` gives for each case what the simulation of the
-    first seed calls, see `simulation.simulate`. Raises Unrecorded, at the end, for recordings that a disk did not take.
+    `if __name__ == "__main__"`. `progress` is called repeatedly. Raises Unrecorded, at the end, for recordings that a
+    disk did not take.
     """
     unrecorded = ""
     _refuse_too_much(read.plan, len(seeds))
@@ -264,7 +262,7 @@ def simulate_seeds(
             duration_s = plan.experiment.duration_s
             stretch.expect(expected_s[name])
             passing = partial(_pass_progress, progress, name, duration_s)
-            log = simulation.simulate(plan, first.seed, progress=passing, watch=watch(name, plan))
+            log = simulation.simulate(plan, first.seed, progress=passing)
             logbook = RunRecorder(log, plan, name)
             first.traces[name] = logbook.trace()
             first.metrics[name] = measure.measure(first.traces[name])

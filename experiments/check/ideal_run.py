@@ -92,7 +92,7 @@ def uncompiled(bare: Plan) -> tuple[str, float]:
     stretch.WORK[0] += stretch.PAYS_S
     flight = simulation.VirtualRun(bare.changed(duration_s=1.0), bare.experiment.seed, quiet=True, lean=True)
     with suppress(conductor.Stuck):
-        flight.fly(landing=False, progress=lambda _: None, watch=None)
+        flight.fly(landing=False)
     if flight.stretches is None or flight.stretches.refusal:
         return "it is not possible" if flight.stretches is None else flight.stretches.refusal, 1.0
     steps = flight.stretches.called_back

@@ -169,7 +169,7 @@ def _time_since(sent: Array, t: float) -> float:
 
 
 class ReplayClock:
-    """Time of a replay or a paced run: plays, pauses, goes by steps, at any speed."""
+    """Time of a replay: plays, pauses, goes by steps, at any speed."""
 
     def __init__(self, begin: float, end: float, t: float = 0.0) -> None:
         self.begin, self.end, self.t = begin, end, t  # [s]
@@ -194,7 +194,7 @@ class ReplayClock:
         self.t = min(max(t, self.begin), self.end)
 
 
-def add_transport(server: viser.ViserServer, clock: ReplayClock, steps: tuple[str, ...]) -> None:
+def _add_transport(server: viser.ViserServer, clock: ReplayClock) -> None:
     """Adds play and pause, also by the space bar, steps of a sample or some seconds, and the speed."""
     import viser  # noqa: PLC0415 - an extra
 
@@ -205,7 +205,7 @@ def add_transport(server: viser.ViserServer, clock: ReplayClock, steps: tuple[st
 
     play = server.gui.add_button("Play / pause (Space)", icon=viser.Icon.PLAYER_PLAY)
     play.on_click(lambda _: clock.toggle())
-    server.gui.add_button_group("step", steps).on_click(step)
+    server.gui.add_button_group("step", ("-1 s", "-1", "+1", "+1 s")).on_click(step)
     given = f"{clock.speed:g}"
     speed = server.gui.add_dropdown("speed", tuple(dict.fromkeys((*SPEEDS, given))), initial_value=given)
     speed.on_update(lambda event: setattr(clock, "speed", float(event.target.value)))
@@ -216,11 +216,19 @@ def add_transport(server: viser.ViserServer, clock: ReplayClock, steps: tuple[st
 class ReplayView:
     """The page of the recordings of a run."""
 
-    def __init__(self, server: viser.ViserServer, films: Sequence[Film], where: str, *, dark: bool) -> None:
-        """Draws all cases beside one another; `where` says which run it is."""
+    def __init__(
+        self, server: viser.ViserServer, films: Sequence[Film], where: str, *, dark: bool, pace: float | None = None
+    ) -> None:
+        """Draws all cases beside one another; `where` says which run it is.
+
+        With a `pace`, a multiple of real time, it plays from the beginning as soon as a page is open.
+        """
         self._server, self._films = server, list(films)
         self._where = where
         self.clock = ReplayClock(min(film.begin for film in films), max(film.end for film in films))
+        if pace is not None:
+            self.clock.t = self.clock.begin
+            self.clock.speed, self.clock.playing = pace, True
         self._drawn: object = None
         self._tabled = -inf
         self._build_controls()
@@ -248,11 +256,11 @@ class ReplayView:
         before = time.monotonic()
         while not ended():
             now = time.monotonic()
-            self.clock.advance(now - before)
-            before = now
             pages = bool(self._server.get_clients())
             if pages:
+                self.clock.advance(now - before)
                 self.draw()
+            before = now
             time.sleep(max(0.001, now + (FRAME_S if pages else IDLE_S) - time.monotonic()))
 
     def draw(self) -> None:
@@ -277,9 +285,9 @@ class ReplayView:
         with gui.add_folder("Replay", order=5.0):
             self._slider: Any = gui.add_slider(
                 "time [s]", min=round(clock.begin, 2), max=max(round(clock.end, 2), round(clock.begin, 2) + STEP_S),
-                step=STEP_S, initial_value=0.0, marks=marks(self._films),
+                step=STEP_S, initial_value=round(clock.t, 2), marks=marks(self._films),
             )  # fmt: skip
-            add_transport(self._server, clock, ("-1 s", "-1", "+1", "+1 s"))
+            _add_transport(self._server, clock)
             if len(self._films) > 1:
                 case = gui.add_dropdown("table of", tuple(film.trace.case for film in self._films))
                 case.on_update(self._choose_case)

@@ -101,7 +101,6 @@ def simulate(
     lean: bool = False,
     landing: bool = True,
     progress: Callable[[float], object] = lambda _: None,
-    watch: Callable[[Snapshot], object] | None = None,
     patience_s: float = PATIENCE_S,
 ) -> VirtualRunLog:
     """Flies one case, compiled.
@@ -113,7 +112,6 @@ def simulate(
             for sweeps. The other columns are empty, and so is the table of received poses.
         landing: Let the robots land; else the log ends with the run.
         progress: Called at state_hz with the time of the experiment [s]; NaN before its start is known.
-        watch: Called at state_hz, and as slow as it likes.
         patience_s: Limit for robots to become ready, airborne or done [s].
 
     Raises:
@@ -122,7 +120,7 @@ def simulate(
     """
     flight = VirtualRun(plan, seed, quiet=quiet, lean=lean, patience_s=patience_s)
     try:
-        flight.fly(landing=landing, progress=progress, watch=watch)
+        flight.fly(landing=landing, progress=progress)
     except FAILURES as error:
         plugins = [each for robot in flight.robots for each in robot.assignment.plugins]
         raise explain(error, plugins) from error
@@ -180,23 +178,15 @@ class VirtualRun:
         self.touches: list[Touch] = []  # contacts that began so far
         self._memory, self._measures = LawColumns(), LawColumns()
 
-    def fly(
-        self, *, landing: bool, progress: Callable[[float], object], watch: Callable[[Snapshot], object] | None
-    ) -> None:
+    def fly(self, *, landing: bool, progress: Callable[[float], object] = lambda _: None) -> None:
         """Flies until all robots are done, or to the end of the run without `landing`."""
         try:
-            self._fly(stretches_of(self) if watch is None else None, landing, progress, watch)
+            self._fly(stretches_of(self), landing, progress)
         except TornError:
             self._begin()
-            self._fly(None, landing, progress, watch)
+            self._fly(None, landing, progress)
 
-    def _fly(
-        self,
-        stretches: Stretches | None,
-        landing: bool,
-        progress: Callable[[float], object],
-        watch: Callable[[Snapshot], object] | None,
-    ) -> None:
+    def _fly(self, stretches: Stretches | None, landing: bool, progress: Callable[[float], object]) -> None:
         conductor, dt = self._conductor, self.dt
         first, self.stretches = self.robots[0], stretches
         while not conductor.over:
@@ -206,8 +196,6 @@ class VirtualRun:
             self._act(t)
             if (first.tick - 1) % self.log_every == 0:  # the robots' count restarts at the common start
                 progress(t - conductor.start_at)
-                if watch is not None:
-                    watch(self.snapshot(t))
                 self._sample(t)
             if not landing and t - conductor.start_at >= self.plan.experiment.duration_s - 0.5 * dt:
                 return

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from experiments.metrics.results import CaseMetrics
     from experiments.real_time.conductor.conduct import RunOptions
     from experiments.recording.run_folder import RunOrigin
-    from experiments.run import Run, Watch
+    from experiments.run import Run
 
 app: Final = typer.Typer()
 
@@ -138,9 +138,8 @@ def _run(origin: RunOrigin, handling: Handling, *, former: Path | None = None, b
         read.keep(folder / SOURCE)
         with using(folder), _kept_origin(folder, origin, read, options, unwritten):
             if origin.virtual:
-                with viewing.paced(handling.pace or 1.0) if handling.view else nullcontext(lambda *_: None) as watch:
-                    runs = _simulate(read, folder, options, origin.seeds, watch, unwritten)
-                    stopped, code = "", 0
+                runs = _simulate(read, folder, options, origin.seeds, unwritten)
+                stopped, code = "", 0
             else:
                 with viewing.following(folder, options.identity) if handling.view else nullcontext():
                     runs, stopped, code = _conduct(read, folder, options, unwritten, quiet=handling.as_json)
@@ -161,6 +160,8 @@ def _run(origin: RunOrigin, handling: Handling, *, former: Path | None = None, b
             code = FAILED if failures or stopped or unwritten or has_passed(judge(cases)) is False else 0
             if not code and any(case.spoiled for case in cases):
                 code = SPOILED
+        if origin.virtual and handling.view and not unwritten:
+            viewing.play(folder, handling.pace or 1.0)
         return code if former is None else max(code, _print_differences(folder, former, quiet=handling.as_json))
     finally:
         remove_unused(folder)
@@ -257,9 +258,7 @@ def _print_differences(folder: Path, former: Path, *, quiet: bool) -> int:
     return int(bool(found))
 
 
-def _simulate(  # noqa: PLR0917 - as `_conduct`
-    read: Document, folder: Path, options: RunOptions, seeds: int, watch: Watch, unwritten: list[str]
-) -> list[Run]:
+def _simulate(read: Document, folder: Path, options: RunOptions, seeds: int, unwritten: list[str]) -> list[Run]:
     """Run in virtual time, one run for each seed from the file's on."""
     from experiments.run import Unrecorded, simulate_seeds
     from tools.progress import Bar
@@ -273,7 +272,6 @@ def _simulate(  # noqa: PLR0917 - as `_conduct`
                 cases=options.cases,
                 folder=folder,
                 progress=lambda case, done, of: bar.show(f"{case}, simulated s", done, of),
-                watch=watch,
             )
     except Unrecorded as error:
         unwritten.append(str(error))

@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from rich.console import Group
 
     from experiments.real_time.hosts.run_registry import RegisteredRun
-    from experiments.run import Watch
     from experiments.scene.condition import RobotRow
     from experiments.view.acting import WatchedRun
     from experiments.view.serving import PageServer
@@ -254,15 +253,13 @@ def following(folder: Path, identity: str) -> Iterator[None]:
             viewer.wait()
 
 
-@contextmanager
-def paced(pace: float) -> Iterator[Watch]:
-    """Inside, runs in virtual time are shown in this process, `pace` times as fast as they would be in real time."""
-    from experiments.view.paced import PacedView
-    from experiments.view.serving import served
+def play(folder: Path, pace: float) -> None:
+    """Play the run of a folder in the browser, `pace` times as fast as real time, until Ctrl-C."""
+    from agents.runtime.command_line import on_termination
 
-    with served(PORT, dark=False) as server:
-        _tell(server, "virtual time: begins when the page is open", open_page=True, to=sys.stderr)
-        yield PacedView(server, pace=pace, dark=False).begin
+    ended = threading.Event()
+    with on_termination(ended.set):
+        _replay(folder, ended, port=PORT, dark=False, open_page=True, pace=pace)
 
 
 def _running_run(folder: Path, *, wait_s: float, ended: threading.Event) -> RegisteredRun | None:
@@ -298,7 +295,9 @@ def _of_run(run: RegisteredRun, identity: str | None) -> WatchedRun:
     return WatchedRun(run.endpoints, run.realm, identity or _default_identity(run.endpoints), run)
 
 
-def _replay(folder: Path, ended: threading.Event, *, port: int, dark: bool, open_page: bool) -> int:
+def _replay(
+    folder: Path, ended: threading.Event, *, port: int, dark: bool, open_page: bool, pace: float | None = None
+) -> int:
     from experiments.recording.playback import read_whole
     from experiments.view import replay as replaying
     from experiments.view.serving import served
@@ -306,8 +305,8 @@ def _replay(folder: Path, ended: threading.Event, *, port: int, dark: bool, open
     files = _recordings(folder)
     films = [replaying.Film(read_whole(file)) for file in files]
     with served(port, dark=dark) as server:
-        page = replaying.ReplayView(server, films, str(folder), dark=dark)
-        _tell(server, f"{folder}; Ctrl-C ends it", open_page=open_page)
+        page = replaying.ReplayView(server, films, str(folder), dark=dark, pace=pace)
+        _tell(server, f"{folder}; Ctrl-C ends it", open_page=open_page, to=sys.stdout if pace is None else sys.stderr)
         page.run(ended.is_set)
     return 0
 

@@ -115,7 +115,7 @@ def test_episodes_are_flights(name, seconds):
         places, _ = fly(made, 7, acting(made, law))
         moved = {each: replace(plan.assignment(each), law=law) for each in made.possible_agents} if gradient else {}
         flight = VirtualRun(plan, 7, assignments=moved)
-        flight.fly(landing=False, progress=lambda _: None, watch=None)
+        flight.fly(landing=False)
         assert len(places) == round(10 * seconds)
         assert np.array_equal(places, flown(flight.log(), len(places)))
 

@@ -7,6 +7,7 @@ import pytest
 from agents.decision.lifecycle import DONE
 from agents.safety.hazards import Cause
 from experiments.file import document
+from experiments.virtual_time import stretch
 from experiments.virtual_time.simulation import VirtualRun, simulate
 from tests.agents.learned import learned
 
@@ -18,20 +19,21 @@ WILD = learned(1, 2, weights=((3e38, 3e38),), observes="time", observes_each="")
 HOARSE = learned(3, 1, bias=-0.05, weights=((1.0,), (0.0,), (0.0,)))
 
 
-def test_wild_policies_end_landed():
+def test_wild_policies_end_landed(monkeypatch):
+    monkeypatch.setattr(stretch, "WORK", [-1e6, 0.0])  # each sample is looked at
     law = f'formation.law={{kind="policy", model="{WILD}"}}'
     plan = document.load("policy", "duration_s=4.0", law).cases()["event"]
     flight, fastest, causes = VirtualRun(plan, 1), [], set()
 
-    def watch(snapshot):
-        for robot, state in zip(snapshot.robots, snapshot.states, strict=True):
+    def look(_time):
+        for robot, state in zip(flight.robots, flight.snapshot(flight.time).states, strict=True):
             low, high = robot.assignment.limits.low, robot.assignment.limits.high
             setpoint, place = robot.setpoint, state.true_position
             assert not isfinite(setpoint[0]) or all(low[k] <= setpoint[k] <= high[k] for k in range(3))
             assert all(low[k] - 0.1 <= place[k] <= high[k] + 0.1 for k in range(3))
             fastest.append(max(map(abs, state.velocity[:2])) / robot.assignment.kind.speed)
 
-    flight.fly(landing=True, progress=lambda _: None, watch=watch)
+    flight.fly(landing=True, progress=look)
     for robot in flight.robots:
         causes |= {each.cause for each in robot.hazards.incidents}
         assert robot.lifecycle.phase == DONE

@@ -15,14 +15,12 @@ import pytest
 from agents.body.kinds import KINDS
 from agents.errors import ExplainedError
 from agents.network import lab, messages, pubsub
-from agents.network.endpoints import free_endpoint
 from agents.network.keys import Keys
 from experiments.file import document
 from experiments.file.document import load
 from experiments.real_time.hosts.run_registry import RegisteredRun
 from experiments.recording.playback import read_whole
 from experiments.recording.reader import RecordingError
-from experiments.run import simulate, simulate_seeds
 from experiments.scene import models
 from experiments.scene.condition import PALED, RINGED, Condition, RobotRow, condition, robot_row
 from experiments.scene.stage import BAD, FAIR, SceneModel, touched
@@ -32,7 +30,7 @@ from experiments.view.broadcast import Broadcast
 from experiments.view.heartbeat import SLOWEST_S, DataAge, frame_s, mark
 from experiments.view.observer import Observer, RobotReport
 from experiments.view.panel import History, css, event_list, link_table, table
-from experiments.view.replay import Film, ReplayClock, marks
+from experiments.view.replay import Film, ReplayClock, ReplayView, marks
 from tests.cases import mostly_slow
 from tests.network import Mute, Net
 from tests.runs import recorded
@@ -107,20 +105,16 @@ def test_only_an_operator_of_a_lab_gives_orders(tmp_path):
     assert (acts("operator"), acts("observer"), acts("operator", tmp_path / "no")) == (True, False, False)
 
 
-@pytest.mark.slow
-def test_watched_virtual_run_is_unchanged_bit_by_bit():
-    pytest.importorskip("viser", reason="needs viser")
-    from experiments.view import paced  # noqa: PLC0415
-    from experiments.view.serving import served  # noqa: PLC0415
-
-    read = load("robotic-park", "duration_s=1.0", "timeline=[]", "cases={}")
-    with served(int(free_endpoint(preferred_port=0).rpartition(":")[2]), dark=True) as server:
-        page = paced.PacedView(server, pace=100.0, dark=True, page_s=0.0)
-        (watched,) = simulate_seeds(read, [1], watch=page.begin)
-    alone = simulate(read, seed=1)
-    for case, trace in alone.traces.items():
-        np.testing.assert_array_equal(watched.traces[case].true_position, trace.true_position)
-    assert page.clock.t > 0.0
+def test_virtual_run_plays_from_its_beginning_once_seen(film):
+    server = MagicMock()
+    view = ReplayView(server, [film], "a run", dark=False, pace=1.0)
+    view.draw = lambda: None
+    assert (view.clock.t, view.clock.speed, view.clock.playing) == (film.begin, 1.0, True)
+    assert film.begin < 0.0
+    for pages, moved in (((), False), (("page",), True)):
+        server.get_clients.return_value, rounds = pages, iter((False, False, True))
+        view.run(lambda rounds=rounds: next(rounds))
+        assert (view.clock.t > film.begin) == moved
 
 
 KEYS = Keys()

@@ -23,7 +23,7 @@ def evaluated(experiment, *, compiled, seed=1, lean=False, change=None):
     stretch.WORK[0] = 1e6 if compiled else -1e6  # compilation pays, or nothing does
     try:
         flight = VirtualRun(Changed(experiment), seed, quiet=False, lean=lean)
-        flight.fly(landing=True, progress=lambda _: None, watch=None)
+        flight.fly(landing=True)
     finally:
         stretch.WORK[:] = 0.0, 0.0
     assert compiled or flight.stretches is None
