@@ -326,7 +326,7 @@ class Inspector(CaseRun):
         return self._view.order([name], order)[name]
 
     def _at_end(self, name: str) -> str:
-        """What a robot that was moved has said last of its motors."""
+        """Last report of a robot that was moved about its motors."""
         self._update()
         seen = self._robots[name]
         off = seen.reached("done") and UNANSWERED not in (seen.status.body if seen.status else "")
