@@ -45,6 +45,7 @@ NAMED_S: Final = 0.05  # [s] shorter holds are not named
 # causes of holds that are not part of an experiment
 HOLDING: Final = (Cause.ORDERED, Cause.POSITION, Cause.ROUTER, Cause.CENTRE, Cause.SUSPENDED)
 CHANGES: Final = {"remove": "removed", "restart": "restarted", "replace": "replaced"}  # orders to the conductor
+ENDED: Final = ("silent", "killed", "changed")  # orders after which the former process of a robot ends, or has ended
 LEAVING: Final = ("ordered to leave", TOLD_TO_END)  # reasons of a robot that lands for one of them
 
 
@@ -198,7 +199,7 @@ def _taken_out(trace: Trace) -> dict[str, str]:
         name = event.source
         if event.kind in CHANGES and "on_loss" not in event.text:
             asked[name] = CHANGES[event.kind]
-        elif event.kind == "killed" or (event.kind == "robot" and any(why in event.text for why in LEAVING)):
+        elif event.kind in ENDED or (event.kind == "robot" and any(why in event.text for why in LEAVING)):
             left.add(name)  # maybe before the order is known: others may end its process at the same time
         else:
             continue

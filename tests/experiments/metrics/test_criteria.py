@@ -178,8 +178,8 @@ def given(*times):
     return [Event(at, "hazard", "CF01", "warn: was given trigger.threshold = 0.02 by an operator") for at in times]
 
 
-def changed_by(who, word="remove"):
-    return [Event(2.0, word, "CF01", f"asked by {who}"), Event(2.1, "robot", "CF01", "landing: ordered to leave")]
+def changed_by(who, word="remove", leaves=("robot", "landing: ordered to leave")):
+    return [Event(2.0, word, "CF01", f"asked by {who}"), Event(2.1, leaves[0], "CF01", leaves[1])]
 
 
 @pytest.mark.parametrize(
@@ -191,6 +191,7 @@ def changed_by(who, word="remove"):
         (held(3.5), None),
         (held(-3.0, -0.5), None),
         (changed_by("ann"), "CF01 was removed by an operator at 2.1 s"),
+        (changed_by("ann", "restart", ("silent", "does not answer: its lifeline is cut")), "CF01 was restarted by an operator at 2.1 s"),
         (changed_by("an operator", "replace"), "CF01 was replaced by an operator at 2.1 s"),
         (changed_by("on_loss", "restart"), None),
         (changed_by("ann")[:1], None),
