@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 LOOK_S = 0.05  # period of samples and rules
 END_S = 0.05  # time after the end of the last process
-OUTSIDE = ("capture", "second ")  # processes that no run has started, and that end by themselves or never
+OUTSIDE = ("operator", "capture", "second ")  # processes that no run has started
 
 _world: World | None = None
 
@@ -121,9 +121,10 @@ class World:
         self.kernel.run(self.now + limit_s)
 
     def note_end(self, process: sim.Process) -> None:
-        """Note that a process has ended, maybe the last one of the run."""
+        """Note that a process has ended, maybe the last one of the run, or of the commands beside it."""
         self.ends.setdefault(process.pid, self.now)
-        if all(each.dead for each in self.processes if not each.name.startswith(OUTSIDE)):
+        awaited = [each for each in self.processes if not each.name.startswith(OUTSIDE)]
+        if all(each.dead for each in [*awaited, *(process for *_, process in self.answers)]):
             self.after(END_S, self.kernel.stop)
 
     def _close_pipes_at_exit(self, process: sim.Process) -> None:

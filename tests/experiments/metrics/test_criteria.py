@@ -191,7 +191,7 @@ def changed_by(who, word="remove", leaves=("robot", "landing: ordered to leave")
         (held(3.5), None),
         (held(-3.0, -0.5), None),
         (changed_by("ann"), "CF01 was removed by an operator at 2.1 s"),
-        (changed_by("ann", "restart", ("silent", "does not answer: its lifeline is cut")), "CF01 was restarted by an operator at 2.1 s"),
+        (changed_by("ann", "restart", ("silent", "its lifeline is cut")), "CF01 was restarted by an operator at 2.1 s"),
         (changed_by("an operator", "replace"), "CF01 was replaced by an operator at 2.1 s"),
         (changed_by("on_loss", "restart"), None),
         (changed_by("ann")[:1], None),
