@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import os
 import signal
@@ -10,6 +11,7 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Final
 
 ONE_THREAD: Final = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
@@ -23,12 +25,15 @@ def cores() -> int:
 
 @contextmanager
 def pool(count: int) -> Iterator[ProcessPoolExecutor | None]:
-    """Pool of `count` processes, started as the work comes in; the end of the block ends them, and their work.
+    """Pool of `count` processes; the end of the block ends them, and their work.
 
-    None for a single process, and with a note where the system has no semaphores: the work is then done in this one.
+    A process with a single thread forks them here, with all that it has imported and compiled. A fork would take the
+    locks of other threads along: then they are spawned as the work comes in. None for a single process, and with a note
+    where the system has no semaphores: the work is then done in this one.
     """
     others = frozenset(multiprocessing.active_children())
-    context = multiprocessing.get_context("spawn")  # a fork would take our threads' locks along
+    alone = sys.platform == "linux" and len([*Path("/proc/self/task").iterdir()]) == 1
+    context = multiprocessing.get_context("fork" if alone else "spawn")
     try:
         made = ProcessPoolExecutor(count, context, initializer=_prepare) if count > 1 else None
     except (OSError, ImportError, NotImplementedError) as error:  # a container without /dev/shm, or with a full one
@@ -43,6 +48,8 @@ def pool(count: int) -> Iterator[ProcessPoolExecutor | None]:
     before = {name: os.environ[name] for name in ONE_THREAD if name in os.environ}
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))  # set for the processes
     try:
+        if alone:
+            made.submit(int)  # forks all, before a thread of a progress bar begins
         yield made
     finally:
         for name in ONE_THREAD:
@@ -58,6 +65,7 @@ def pool(count: int) -> Iterator[ProcessPoolExecutor | None]:
 def _prepare() -> None:
     """In each process: Ctrl-C is the parent's, and the process ends with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    gc.freeze()  # what the parent has made is no garbage, and its pages stay shared
     parent = multiprocessing.parent_process()
     assert parent is not None
 

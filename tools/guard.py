@@ -5,6 +5,7 @@ Only the standard library, and nothing of ours, is imported before the check.
 
 from __future__ import annotations
 
+import gc
 import importlib.util
 import os
 import signal
@@ -78,6 +79,7 @@ def main() -> None:
             sys.exit(2)
         for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):  # threads of numpy that wait for each other spin
             os.environ.setdefault(name, "1")
+        gc.set_threshold(10_000)  # imports and translations make many objects, and little garbage
         _become_station(sys.argv[1:])
         from tools.main import main as command_line  # noqa: PLC0415 (not before the check)
 

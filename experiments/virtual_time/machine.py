@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import ctypes
+import fcntl
 import hashlib
 import multiprocessing
 import platform
 import shutil
 import subprocess
 import sys
-import tempfile
 from collections.abc import Sequence
 from functools import cache
 from importlib.util import find_spec
@@ -112,11 +112,14 @@ def by_cc(text: str) -> Any:
         folder = private(cache_folder() / "programs")
         file = folder / f"{digest}.so"
         if not file.exists():
-            with tempfile.TemporaryDirectory(dir=folder) as apart:  # another process may make the same
-                source, made = Path(apart, "program.c"), Path(apart, "program.so")
-                source.write_text(text, encoding="utf-8")
-                subprocess.run([cc, *FLAGS.split(), source, "-o", made, "-lm"], check=True, capture_output=True)
-                made.replace(file)
+            source, made = file.with_suffix(".c"), file.with_suffix(".part")
+            with source.open("a", encoding="utf-8") as written:
+                fcntl.flock(written, fcntl.LOCK_EX)  # another process may be making the same
+                if not file.exists():
+                    source.write_text(text, encoding="utf-8")
+                    subprocess.run([cc, *FLAGS.split(), source, "-o", made, "-lm"], check=True, capture_output=True)
+                    made.replace(file)
+            source.unlink(missing_ok=True)
         return ctypes.CDLL(str(file))
     except (OSError, RuntimeError, subprocess.CalledProcessError):
         return None

@@ -77,6 +77,11 @@ def stretch(crew, k, end, leg, dt, log_every, instant):
             return k
     return k
 """
+PARTS: Final = {  # parts of the driver, of each group of robots
+    "advance": "advance({}, t, dt)", "begin_step": "begin_step({})", "end_step": "end_step({}, t, dt)",
+    "deliver": "deliver({}, t)", "observe": "moves = observe({}, t) or moves", "transmit": "transmit({}, t, ledger)",
+    "detect": "trouble = detect({}, t) or trouble", "pursue": "pursue({}, t)", "note": "note({}, ledger)",
+}  # fmt: skip
 TYPES: Final[dict[str, Any]] = {WHOLE: ctypes.c_int64, DOUBLE: ctypes.c_double, BOOLEAN: ctypes.c_bool}
 GIVEN: Final = (WHOLE, WHOLE, WHOLE, DOUBLE, WHOLE, BOOLEAN)  # arguments of the driver behind the crew
 WORK: Final = [0.0, 0.0]  # seconds of plain Python that flights of this process take, about, and that were announced
@@ -144,9 +149,17 @@ class CompiledLoop:
     """Compiled loop over ticks for a crew, or why there is none."""
 
     program: Program
-    often: bool  # compiled for speed
+    text: str = ""  # program in C
+    often: bool = False  # compiled for speed
     run: Any = None
     refusal: str = ""
+
+    def compile(self, *, often: bool) -> None:
+        """Compile it, unless that is done; raises NoCompilerError."""
+        if self.run is None or often > self.often:
+            (address,) = machine.machine(self.text, ["fly"], often=often)
+            of_c = ctypes.PYFUNCTYPE(ctypes.c_int64, ctypes.c_void_p, *(TYPES[kind] for kind in (*GIVEN, WHOLE)))
+            self.often, self.run = often, of_c(address)
 
 
 @dataclass
@@ -396,32 +409,17 @@ def _goes_on(robot: Robot, t: float) -> bool:
 
 def driver(crew: RecordLayout, groups: int, names: Sequence[str], *, often: bool) -> CompiledLoop:
     """Compiled loop over ticks for a crew of this number of groups, of robots with these names."""
-    known = DRIVERS.get(crew)
     numbers = {name: number for number, name in enumerate(names)}
-    if known is None or known.program.changed() or often > known.often or known.program.names != numbers:
-        DRIVERS[crew] = known = CompiledLoop(Program(numbers), often)
-
-        def each(text: str) -> str:
-            return "; ".join(text.format(f"crew.g{k}") for k in range(groups))
-
-        source = DRIVER.format(
-            advance=each("advance({}, t, dt)"),
-            begin_step=each("begin_step({})"),
-            end_step=each("end_step({}, t, dt)"),
-            deliver=each("deliver({}, t)"),
-            observe=each("moves = observe({}, t) or moves"),
-            transmit=each("transmit({}, t, ledger)"),
-            detect=each("trouble = detect({}, t) or trouble"),
-            pursue=each("pursue({}, t)"),
-            note=each("note({}, ledger)"),
-        )
-        try:
-            text = known.program.entry(source, vars(tick), (crew, *GIVEN))
-            (address,) = machine.machine(text, ["fly"], often=often)
-        except Exception as error:  # noqa: BLE001 - of any plug-in and compiler: the run is flown without them
-            named = isinstance(error, OutsideError | machine.NoCompilerError)
-            known.refusal = str(error) if named else f"{type(error).__name__}: {error}"
-        else:
-            of_c = ctypes.PYFUNCTYPE(ctypes.c_int64, ctypes.c_void_p, *(TYPES[kind] for kind in (*GIVEN, WHOLE)))
-            known.run = of_c(address)
+    before = DRIVERS.get(crew)
+    fits = before is not None and before.program.names == numbers and not before.program.changed()
+    DRIVERS[crew] = known = before if fits and before is not None else CompiledLoop(Program(numbers))
+    try:
+        if known is not before:
+            parts = {name: "; ".join(text.format(f"crew.g{k}") for k in range(groups)) for name, text in PARTS.items()}
+            known.text = known.program.entry(DRIVER.format(**parts), vars(tick), (crew, *GIVEN))
+        if not known.refusal:
+            known.compile(often=often)
+    except Exception as error:  # noqa: BLE001 - of any plug-in and compiler: the run is flown without them
+        named = isinstance(error, OutsideError | machine.NoCompilerError)
+        known.refusal = str(error) if named else f"{type(error).__name__}: {error}"
     return known

@@ -10,7 +10,6 @@ import math
 import re
 import sys
 from collections.abc import Mapping, Sequence
-from functools import partial
 from types import FunctionType
 from typing import Any, Final
 
@@ -68,7 +67,7 @@ class Calls(Expressions):
         if name in layout.fixed:
             empty = name in getattr(layout.owner, "NAMED", ())
             return self.with_names(dict, {}) if empty else self.known(layout.fixed[name], node)
-        found = self._program.look(partial(inspect.getattr_static, layout.owner, name, ...))
+        found = self._program.look(inspect.getattr_static, layout.owner, name)
         if isinstance(found, property) and isinstance(found.fget, FunctionType):
             return self.call(found.fget, [thing], {}, node)
         if found is ...:
@@ -91,7 +90,7 @@ class Calls(Expressions):
             of = getattr(given[0].type, "owner", None)
             if node.func.attr in getattr(of, "CHECKS", ()):  # the types of values are checked here
                 return given[1]
-            found = self._program.look(partial(inspect.getattr_static, of, node.func.attr, None))
+            found = self._program.look(inspect.getattr_static, of, node.func.attr)
         if not isinstance(found, FunctionType):
             raise self.error(node, f"a call of {ast.unparse(node.func)}")
         if found is RobotFacts.of and isinstance(given[1].constant, Mapping):

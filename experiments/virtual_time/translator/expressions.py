@@ -65,7 +65,7 @@ class Translated(Protocol):
     def c(self, kind: Any) -> str:
         """C's name of a type."""
 
-    def look(self, way: Callable[[], Any]) -> Any:
+    def look(self, get: Callable[..., Any], place: Any, name: str, default: Any = ...) -> Any:
         """Present meaning of a name."""
 
     def function(self, function: FunctionType, types: Sequence[Any]) -> tuple[str, Any]:
@@ -208,7 +208,7 @@ class Expressions(ast.NodeVisitor):
 
     def named(self, name: str) -> Any:
         """Meaning of a name outside of the function, ... if it has none."""
-        return self._program.look(partial(self._space.get, name, getattr(builtins, name, ...)))
+        return self._program.look(dict.get, self._space, name, getattr(builtins, name, ...))
 
     def known(self, found: Any, node: ast.AST) -> Value:
         try:
@@ -222,7 +222,7 @@ class Expressions(ast.NodeVisitor):
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id not in self._locals:
             owner = self.named(node.value.id)
             if isinstance(owner, ModuleType | type):
-                return self._program.look(partial(getattr, owner, node.attr, None))
+                return self._program.look(getattr, owner, node.attr, None)
         return ...
 
     def visit_Subscript(self, node: ast.Subscript) -> Value:

@@ -15,7 +15,7 @@ import re
 import sys
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import cache
+from functools import cache, partial
 from itertools import count
 from pathlib import Path
 from types import FunctionType
@@ -84,7 +84,7 @@ class Program:
         self.called_back: dict[str, str] = {}  # rare functions that stay in Python, with the reasons
         self.measures: list[str] = []  # names of the measures of all laws
         self._numbers = count()
-        self._found: list[tuple[Callable[[], Any], Any]] = []  # what names stood for, each with a way to look again
+        self._found: dict[tuple[Any, int, str], tuple[Callable[[], Any], Any]] = {}  # see `look`; each with a way to it
         self._names: dict[Any, str] = {}  # names of types
         self._functions: dict[Any, tuple[str, Any] | None] = {}  # names and types of results; None: under way
         self._texts = list[str]()  # types and functions, each behind those that it needs
@@ -120,14 +120,16 @@ class Program:
     def _stored(self, kind: Any) -> str:
         return STORED[kind] if isinstance(kind, str) else self.c(type_of(kind))
 
-    def look(self, way: Callable[[], Any]) -> Any:
-        """Present meaning of a name; `changed` looks again."""
-        self._found.append((way, found := way()))
-        return found
+    def look(self, get: Callable[..., Any], place: Any, name: str, default: Any = ...) -> Any:
+        """Present meaning of a name, which is what `get` finds in a place; `changed` looks again."""
+        if (key := (get, id(place), name)) not in self._found:
+            way = partial(get, place, name, default)
+            self._found[key] = way, way()
+        return self._found[key][1]
 
     def changed(self) -> bool:
         """Whether a function or a constant has become another one since the walk."""
-        return any(way() is not value for way, value in self._found)
+        return any(way() is not value for way, value in self._found.values())
 
     def function(self, function: FunctionType, types: Sequence[Any]) -> tuple[str, Any]:
         """C's name of a function for arguments of these types, and the type of its result."""
