@@ -11,7 +11,7 @@ from agents.vectors import ZERO, Vector, norm
 
 FRESH_S: Final = 0.5  # older positions are lost; robots tolerate as much
 LANDING_S: Final = 10.0  # time from `land`, and a slow descent, until a robot without positions counts as landed
-GROUNDED_S: Final = 1.0  # time measured on the ground after which a robot in flight has landed by itself
+GROUNDED_S: Final = 1.0  # time measured on the ground after which a robot has landed that was not seen to descend
 AWAY_M: Final = 0.05  # [m] height above the ground: higher is in the air, lower is down
 FLOOR_M: Final = 0.2  # [m] a take-off from higher up is one from a table: the floor is at 0
 TABLE_M: Final = 0.3  # [m] horizontally from there it ends
@@ -48,7 +48,7 @@ class MeasuredFlight:
             measured: Time of the position.
             position: [m].
             velocity: [m/s].
-            climbing: A take-off is under way: the robot stands before it rises.
+            climbing: An order is repeated; after one to take off the robot stands before it rises.
         """
         if not self.flying:
             return False
@@ -61,14 +61,18 @@ class MeasuredFlight:
         elif z > self._highest:
             self._highest = z
         grounded = not aged and self._on_ground(position) and abs(velocity[2]) < SETTLED
-        self._grounded_since = min(self._grounded_since, now) if grounded and not climbing else inf
+        stands = grounded and (landing or not climbing)
+        self._grounded_since = min(self._grounded_since, now) if stands else inf
+        grounded_s, came_down = now - self._grounded_since, self._highest - z > AWAY_M
         if not landing:
-            down = now - self._grounded_since > GROUNDED_S
+            down = grounded_s > GROUNDED_S
         elif aged:
             descent = LANDING_S if isnan(z) else max(LANDING_S, z / LOWEST_DESCENT_M_S)
             down = now - self.landing_since > descent
-        else:  # else it has come lower and stands: on a table
-            down = grounded or (self._highest - z > AWAY_M and now - self._still_since > LANDING_S)
+        elif grounded:  # one that was ordered down as it began to climb is as low and as slow
+            down = came_down or grounded_s > GROUNDED_S
+        else:  # it has come lower and stands: on a table
+            down = came_down and now - self._still_since > LANDING_S
         self.flying = not down
         return down
 

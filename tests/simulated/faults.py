@@ -94,16 +94,26 @@ def _spoil_link(world: World, fault: Fault) -> None:
     """Let the links of a process drop, repeat, swap or delay messages."""
     name = {"duplicate": "dup"}.get(fault.kind, fault.kind)
     for session in world.sessions(fault.who):
-        before = getattr(session, name)
-        setattr(session, name, fault.size)
-        world.after(fault.lasts, partial(setattr, session, name, before))
+        _set_for(world, session, name, fault)
 
 
 def _delay(world: World, fault: Fault) -> None:
     """Let each sleep of a process last too long."""
     if (process := world.process(fault.who)) is not None:
-        before, process.late = process.late, fault.size
-        world.after(fault.lasts, partial(setattr, process, "late", before))
+        _set_for(world, process, "late", fault)
+
+
+def _set_for(world: World, thing: object, name: str, fault: Fault) -> None:
+    """Set an attribute to the size of a fault while it lasts, and then to that of another one that does, or back."""
+    usual, sizes = world.altered.setdefault((thing, name), (getattr(thing, name), []))
+    sizes.append(fault)
+    setattr(thing, name, fault.size)
+
+    def end() -> None:
+        sizes[:] = [each for each in sizes if each is not fault]
+        setattr(thing, name, sizes[-1].size if sizes else usual)
+
+    world.after(fault.lasts, end)
 
 
 def _hang(world: World, fault: Fault) -> None:

@@ -19,6 +19,7 @@ from tests.simulated.look import AT_THE_END, OF_COMMANDS, OF_PAIRS, OF_POSES, OF
 from tests.simulated.world import LOOK_S, World
 
 LIES = {"body", "capture", "step"}  # faults that let a robot believe what is not true
+OF_LINKS = {"loss", "duplicate", "reorder"}  # faults under which orders are repeated until they are obeyed
 HELD = ("hold", "land", "cut")  # worst hazards with which a robot does not go on
 
 
@@ -105,7 +106,8 @@ def _carried(look: Look, seen: Seen) -> bool:
 
 def _misled(look: Look, seen: Seen) -> bool:
     """Whether its body, world or process cannot do what it should; a twin stands still while its process hangs."""
-    if _carried(look, seen) and any("world" in {fault.who, *str(fault.size).split()} for fault in look.world.script):
+    of_world = (each for each in look.world.script if "world" in {each.who, *str(each.size).split()})
+    if _carried(look, seen) and any(each.kind not in OF_LINKS for each in of_world):
         return True
     faults = [fault for fault in look.world.script if fault.who == seen.name]
     sizes = [str(fault.size) for fault in faults if fault.kind in {"body", "capture"}]

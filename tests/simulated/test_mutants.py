@@ -160,6 +160,18 @@ MUTANTS = {
         f"{CONDUCTOR}orders.py", "            self.launcher.stop(stop)", "            pass",
         test_safety.test_stop_without_router_goes_by_lifelines,
     ),
+    "world that waits for its robots to be stopped": (
+        "experiments/real_time/processes/world.py", "if self._stopped.is_set():", "if False:",
+        partial(test_safety.test_world_obeys_a_stop_itself, test_safety.UNHEARD["router suspended"]),
+    ),
+    "down while it begins to climb": (
+        "bridges/measured_flight.py", "down = came_down or grounded_s > GROUNDED_S", "down = True",
+        partial(test_safety.test_robot_ordered_down_in_its_climb_lands, "loss"),
+    ),
+    "failures of the recording alone": (
+        f"{CONDUCTOR}conductor.py", "*failed_robots(events, self._robots).values(), ", "",
+        run("told_too_late_for_the_recorder"),
+    ),
     "thawed launcher goes on": (
         f"{CONDUCTOR}run_view.py", "if self._launcher.last_silence > self._begun:", "if False:",
         test_hosts.test_frozen_launcher_lands_all_and_gives_no_order,

@@ -1,9 +1,12 @@
 """The simulated network by itself; `test_conformance` compares it with the real one."""
 
+from types import SimpleNamespace
+
 import pytest
 import zenoh
 
 from agents.network.zenoh_config import config, settings
+from tests.simulated import faults
 from tests.simulated.kernel import BEGIN, Kernel, Process, sleep
 from tests.simulated.network import Network
 
@@ -115,3 +118,20 @@ def test_a_client_goes_over_to_another_router(kernel):
         ("park/a/alive", True),
         ("park/a/pose", b"2"),
     ]
+
+
+def test_link_is_whole_after_overlapping_faults():
+    """The end of the second one brought the first one back, for good (seed 120889)."""
+    with Kernel(1) as kernel:
+        stage = Stage(kernel)
+        stage.process("A", stage.witness)
+        kernel.run(BEGIN + 1.0)
+        (session,), losses = stage.network.sessions, []
+        laboratory = SimpleNamespace(altered={}, sessions=lambda _: [session], after=kernel.after)
+        for at, lasts, share in ((1.0, 2.0, 0.3), (2.0, 2.0, 0.9), (2.5, 0.2, 0.5)):
+            fault = faults.Fault(at, "loss", "A", share, lasts)
+            kernel.at(BEGIN + at, faults.KINDS["loss"], laboratory, fault)
+        for t in (1.5, 2.6, 2.8, 3.5, 4.5):
+            kernel.run(BEGIN + t)
+            losses.append(session.loss)
+    assert losses == [0.3, 0.5, 0.9, 0.9, 0.0]

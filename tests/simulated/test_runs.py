@@ -68,6 +68,15 @@ ROWS = {
     "restarted": Run(3, "B was restarted by an operator at 1.", order(1.0, "restart")),
     "replaced": Run(3, "B was replaced by an operator at 1.", order(1.0, "replace --body twin")),
     "interrupted": Run(130, "Interrupted after 1.0 s of 3 s", (Fault(1.0, "interrupt"),)),
+    "told_too_late_for_the_recorder": Run(  # seed 130855
+        1,
+        "B at 4.1 s: land: its control loop hangs",
+        (
+            Fault(2.985, "hang", "B", 0.8),
+            Fault(3.2, "cut", "conductor", lasts=0.9),
+            Fault(3.9, "slow", "conductor", 3e4, 30.0),
+        ),
+    ),
     "recorder_killed": Run(1, "the recorder ended (killed by SIGKILL)", (Fault(1.0, "kill", "recorder"),)),
     "recorder_hangs_to_the_end": Run(
         1, "the recording breaks off after", (Fault(1.0, "pause", "recorder", lasts=inf),)

@@ -12,6 +12,7 @@ from tests.simulated.small import AT_S, DRONE, PAIR, TICK_S, TRIO, body, hall
 from tests.simulated.world import LOOK_S
 
 FLIER, WHEELS = "crazyflie", "khepera4"
+WORLD = DRONE.replace("hover = 0.8", 'hover = 0.8, body = "world"')
 LOST = "its own position is lost"
 SILENT = "no connection to a router"
 SOON_S = 2.5 * TICK_S  # the robot reads its body, decides and tells
@@ -335,11 +336,37 @@ def test_stop_that_no_body_obeys_is_told():
 
 
 def test_stop_that_no_body_confirms_is_told():
-    frozen = DRONE.replace("hover = 0.8", 'hover = 0.8, body = "world"')
-    flight = fly(frozen, Fault(AT_S, "pause", "world", lasts=60.0), Fault(AT_S, "estop"), settings=["rates.body_hz=50"])
+    flight = fly(WORLD, Fault(AT_S, "pause", "world", lasts=60.0), Fault(AT_S, "estop"), settings=["rates.body_hz=50"])
     (stop,) = flight.happened("stop")
     (told,) = flight.happened("body", "C", "the emergency stop is not answered")
     assert stop.t + 2.5 - HEARD_S < told.t < stop.t + 2.5 + HEARD_S
+
+
+UNHEARD = {
+    "robot cut off": Fault(AT_S, "cut", "C", lasts=9.0),
+    "robot suspended": Fault(AT_S, "pause", "C", lasts=9.0),
+    "world cut off": Fault(AT_S, "cut", "world", lasts=9.0),
+    "messages of the world lost": Fault(AT_S, "loss", "world", 0.9, 9.0),  # seed 120567
+    "router suspended": Fault(AT_S, "pause", "router", lasts=9.0),
+}
+
+
+@pytest.mark.parametrize("fault", UNHEARD.values(), ids=UNHEARD)
+def test_world_obeys_a_stop_itself(fault):
+    """Orders of its robots had to reach it: motors stayed on for up to 8.7 s."""
+    flight = fly(WORLD, fault, Fault(1.505, "estop"), settings=["rates.body_hz=50"])
+    assert flight.robots["C"].off(after=1.505) < 1.505 + 0.1
+    assert flight.violations == []
+
+
+@pytest.mark.parametrize("spoils", ["", "cut", "loss"])
+def test_robot_ordered_down_in_its_climb_lands(spoils):
+    """Below 5 cm and slow it counted as landed, and its order was not repeated any more (seed 132407)."""
+    spoilt = [Fault(0.55, spoils, "world", 0.9, 0.4 if spoils == "cut" else 2.0, since="ready")] if spoils else []
+    flight = fly(WORLD, *spoilt, Fault(0.6, "order", "C", "land", since="ready"), settings=["rates.body_hz=50"])
+    robot = flight.robots["C"]
+    assert robot.off() < robot.entered("done")[0] < robot.off() + 1.2
+    assert flight.violations == []
 
 
 def test_robot_that_was_ordered_to_hold_holds():

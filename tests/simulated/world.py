@@ -60,6 +60,7 @@ class World:
         self.populations: list[tuple[sim.Process, world_population.WorldBodies]] = []
         self.readings: dict[str, Any] = {}  # faults of measurements by robot: word, number, memory
         self.captures: dict[str, Any] = {}
+        self.altered: dict[tuple[object, str], tuple[float, list[Fault]]] = {}  # usual values, and faults that last
         self.disks: dict[str, Any] = {}  # disks by the name of a process in a script
         self.robots: dict[str, sim.Process] = {}  # newest process that the run has started
         self.launched: dict[str, list[str]] = {}  # command lines of robots

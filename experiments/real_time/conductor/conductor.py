@@ -14,12 +14,15 @@ from math import inf
 from pathlib import Path
 from typing import Final
 
+from msgspec.structs import replace
+
 from agents.clock import Clock
 from agents.decision.lifecycle import PAUSED, TOLD_TO_END
 from agents.network import messages
 from agents.network.keys import Keys
 from agents.runtime.orders import LAND, STOP
 from experiments.file.document import write_json
+from experiments.metrics.failures import failed_robots
 from experiments.real_time.conductor import run_view
 from experiments.real_time.conductor.case_processes import CaseContext, CaseProcesses
 from experiments.real_time.conductor.hot_changes import HotChanges
@@ -131,7 +134,10 @@ class Conductor(CaseRun):
             self._processes.end()
             parted = self._processes.join_parts()
         lost = tuple(name for name, view in self._robots.items() if view.left_because == "lost")
-        failures = [*([f"lost {', '.join(lost)}"] if lost else []), *self.failures, *([parted] if parted else [])]
+        # the last events may have come too late for the recorder
+        zero = inf if start is None else start
+        events = [replace(event, stamp=event.stamp - zero) for event in self._progress.events]
+        failures = [*failed_robots(events, self._robots).values(), *self.failures, *([parted] if parted else [])]
         landed = [f"{', '.join(names)} {reason} by an operator" for (reason, _), names in self._landed.items()]
         held = [f"{', '.join(sorted(self._held))} held by an operator to the end"] if self._held else []
         halted = "; ".join([*landed, *held])
@@ -176,7 +182,7 @@ class Conductor(CaseRun):
             raise run_view.RunFailed(self.start_failure(late, f"not ready after {limit_s:g} s"))
         for name in late:
             self._robots[name].left_because = "late"
-            self._fail(name, f"takes no part: it is not ready: {self._reason(name)}")
+            self._view.report("failed", name, f"takes no part: it is not ready: {self._reason(name)}")
         return on
 
     def await_phase(
@@ -324,22 +330,14 @@ class Conductor(CaseRun):
             off = 0.0 if view.began is None else view.began + view.clock_off - start
             if abs(off) > TARDY_S:
                 text = f"began {abs(off):.2f} s {'before' if off < 0.0 else 'after'} the common start"
-                if abs(off) <= LATE_S:
-                    self._view.report("late", name, text)
-                else:
-                    self._fail(name, text)
-
-    def _fail(self, name: str, text: str) -> None:
-        """Report a failure of a robot; a conductor that is cut off cannot tell the recorder."""
-        self._view.report("failed", name, text)
-        self.failures.append(f"{name} {text}")
+                self._view.report("late" if abs(off) <= LATE_S else "failed", name, text)
 
     def _report_unbegun(self) -> None:
         """Report robots that did not begin at all, at the end of a run that went on to there."""
         for name in [] if self._context.ended() else sorted(self._starting):
             view = self._robots[name]
             if view.began is None and not view.gone and not (view.status is not None and view.status.started):
-                self._fail(name, f"took no part: it did not begin: {self._reason(name)}")
+                self._view.report("failed", name, f"took no part: it did not begin: {self._reason(name)}")
 
     def _land(self) -> None:
         self._view.refuse_joining()

@@ -70,6 +70,7 @@ def joined(
     stop: threading.Event,  # ends the wait for a router when it is set
     on_signal: Callable[[], object],  # called by SIGINT and SIGTERM
     lost: threading.Event | None = None,  # set when the lifeline is lost; None: standard input is no lifeline
+    on_line: Callable[[bytes], None] | None = None,  # called with each line of the lifeline that is no heartbeat
     token: str = "",  # liveliness key that only one process may own; empty: none
     taken: str = "",  # text of the error if another process owns it
 ) -> Iterator[Network]:
@@ -82,7 +83,7 @@ def joined(
     began, realm = Clock().utc(), plan.experiment.network.realm
     if lost is not None:
         detach()  # a full disk, which takes no output, ends no process
-        Lifeline(lost).start()
+        Lifeline(lost, on_line=on_line).start()
     with on_termination(on_signal):
         session = network.open_session(endpoints, name=name, stop=stop, rights=mesh.member_rights(plan, endpoints))
         with closing_cleanly(session) as (session, declared):

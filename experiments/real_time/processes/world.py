@@ -21,6 +21,7 @@ from agents.network import messages, pubsub
 from agents.network.keys import Keys
 from agents.network.shutdown import Farewell, end
 from agents.runtime import command_line
+from agents.runtime.lifeline import stop_in
 from agents.ticks import Ticks
 from experiments.definition.experiment import WORLD
 from experiments.definition.plan import Plan
@@ -64,8 +65,10 @@ class WorldProcess:
         joint: Network,
         lost: threading.Event,
         clock: Callable[[], float] = uptime,
+        *,
+        stopped: threading.Event | None = None,
     ) -> None:
-        """`lost` is set to end as soon as the robots have landed."""
+        """`lost` is set to end as soon as the robots have landed, `stopped` to stop them all at once."""
         session, self._keys = joint.session, joint.keys
         self._ownership, self._over = joint.ownership, threading.Event()
         self._population, self._session, self._lost = population, session, lost
@@ -79,6 +82,8 @@ class WorldProcess:
         self.publications = Publications(plan, population, joint, self.events)
         self._reports = pubsub.pose_publisher(session, self._keys.world, messages.JSON)
         self._orders = pubsub.Orders(session, self._keys.world_order, messages.WorldOrder)
+        self._stopped = stopped = stopped or threading.Event()
+        self._estop = pubsub.ImmediateSubscriber(session, self._keys.estop, lambda _: stopped.set())
         self._pace = Pace()
         self.paused = False
         names = zip(population.names, population.carried, strict=True)
@@ -119,6 +124,9 @@ class WorldProcess:
         if self._lost.is_set() and self.paused:
             self.paused, changed = False, True  # robots that must land cannot wait
         self.commands.receive(t)
+        if self._stopped.is_set():  # commands that came before do not count
+            self._stopped.clear()
+            self.commands.stop()
         self.states.receive(t, self.utc)
         if not self.paused:
             self.commands.apply(t)
@@ -184,10 +192,14 @@ def serve(launch: WorldLaunch) -> int:
         raise refusal(launch.file, "no robot of this experiment lives in a world", hint)
     if launch.engine is not None:
         plan = plan.changed(world=msgspec.structs.replace(plan.experiment.world, engine=launch.engine))
-    over, lost = threading.Event(), threading.Event()
+    over, lost, stopped = threading.Event(), threading.Event(), threading.Event()
 
     def leave() -> None:
         (over if lost.is_set() else lost).set()  # a second signal does not wait for robots to land
+
+    def obey(line: bytes) -> None:
+        if stop_in(line) is not None:
+            stopped.set()
 
     population = WorldBodies(plan)
     with joined(
@@ -197,12 +209,13 @@ def serve(launch: WorldLaunch) -> int:
         stop=lost,
         on_signal=leave,
         lost=lost if launch.lifeline else None,
+        on_line=obey,
         token=Keys(plan.experiment.network.realm).world_alive,
         taken="a world runs",
     ) as joint:
         # before a watch of those tokens begins: a session that watches answers from what it has received
         alive = _alive(joint.session, joint.keys)
-        world = WorldProcess(plan, population, joint, lost)
+        world = WorldProcess(plan, population, joint, lost, stopped=stopped)
         joint.declared.append(world)
         back = world.states.restore(alive)
         for name, flying in back.items():

@@ -109,6 +109,14 @@ class Commands:
                 self.done[command.robot] = command.seq
                 self._obey(row, command, t)
 
+    def stop(self) -> None:
+        """Switches all motors off and halts all wheels, as an emergency stop demands of the robots themselves, too."""
+        rows = [*self._row.values()]
+        for row in rows:
+            self._given[row], self._held[row] = NO_SETPOINT, False
+            self.quiet[row] = inf
+        self._population.body.stop(rows)
+
     def forgive(self, seconds: float, t: float) -> None:
         """Forgives silence after the world stood still for `seconds`, until `t`."""
         if seconds > HANG_S:

@@ -203,7 +203,6 @@ def test_start_apart_from_all_others_is_told(began, behind, kind, said):
     view.began, view.behind, course._starting = START + began, behind, {"KH01"}
     course._report_tardy(START)
     assert [call.args for call in course.view.report.call_args_list] == ([(kind, "KH01", said)] if kind else [])
-    assert course.failures == ([f"KH01 {said}"] if kind == "failed" else [])
     assert not course._starting
 
 
@@ -213,7 +212,6 @@ def test_robot_that_never_began_fails_the_run():
     course.walk(START)
     course._report_unbegun()
     assert course.said("failed") == [("KH02", "took no part: it did not begin: it is airborne")]
-    assert course.failures == ["KH02 took no part: it did not begin: it is airborne"]
 
 
 def test_frozen_robot_is_given_up_and_killed_soon(passing):
