@@ -131,7 +131,7 @@ MUTANTS = {
         test_changes.test_killed_robot_is_restarted_and_takes_part,
     ),
     "watchdog that does not land": (
-        WATCHDOG, 'self._call_in_thread("land", lambda: self._body.land(self._rows))', "pass",
+        WATCHDOG, 'self._order_each("land", self._body.land)', "pass",
         test_safety.test_hanging_loop_is_landed_then_cut,
     ),
     "watchdog that does not end": (
