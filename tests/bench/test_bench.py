@@ -8,9 +8,9 @@ import time
 import numpy as np
 import pytest
 
-from tests.bench import __main__ as renewal
-from tests.bench import growth, peers
-from tests.bench.drivers import ring
+from docs.bench import __main__ as renewal
+from docs.bench import growth, peers
+from docs.bench.drivers import ring
 from tests.bench.process import Meter
 from tests.reliability.soak import usage_of
 
@@ -44,8 +44,8 @@ def test_zenpark_counts_its_agent_steps():
 
 
 def test_ended_process_gives_its_last_words(monkeypatch):
-    monkeypatch.setattr(peers, "DRIVERS", "tests.bench.missing")
-    with pytest.raises(peers.Failed, match=r"7 robots: .*tests\.bench\.missing"):
+    monkeypatch.setattr(peers, "DRIVERS", "docs.bench.missing")
+    with pytest.raises(peers.Failed, match=r"7 robots: .*docs\.bench\.missing"):
         peers.measured(peers.WHEELS, 7, "10", "loop")
 
 

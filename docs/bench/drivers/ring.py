@@ -13,8 +13,8 @@ import numpy as np
 STEP_S = 0.02  # of the law, and of the bodies where the simulator lets us choose
 SPACING = 0.6  # [m]
 SCATTER = 0.1  # of the starts, on each axis [m]
-GAIN = 1.0  # of robots that are told velocities [1/s]
-CLOSER = {"khepera4": 0.5, "crazyflie": 0.2}  # gain of robots that are told places, which those that lag must have less
+GAIN = 1.0  # gain of robots with velocities as commands [1/s]
+CLOSER = {"khepera4": 0.5, "crazyflie": 0.2}  # gain of robots with places as commands: less for those that lag
 LARGEST = 0.2  # speed on each axis [m/s], or way to the next place [m]
 WARM_UP = 20  # steps, the first one compiles
 MOST_STEPS = 500  # of one measurement: 10 s

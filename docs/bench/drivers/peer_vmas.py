@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torchrl.envs.libs.vmas import VmasEnv
 
-from tests.bench.drivers import ring
+from docs.bench.drivers import ring
 
 STEP_S, DRAG = 0.1, 0.25
 

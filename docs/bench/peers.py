@@ -1,11 +1,11 @@
 """zenpark beside other simulators: agent-steps per CPU second of the step loop alone, with ratios of the same minutes.
 
-    python -m tests.bench.peers                      # those that are small to install, and bare Zenoh
-    python -m tests.bench.peers vmas crazyflow       # these; VMAS needs torch (5.5 GB), crazyflow JAX (1.2 GB)
-    python -m tests.bench.peers --all
+    python -m docs.bench.peers                      # those that are small to install, and bare Zenoh
+    python -m docs.bench.peers vmas crazyflow       # these; VMAS needs torch (5.5 GB), crazyflow JAX (1.2 GB)
+    python -m docs.bench.peers --all
 
 Each simulator gets an environment of its own below `~/.cache/zenpark/peers` (remove its folder for newer versions) and
-flies `tests/bench/drivers/ring.py`: the same ring, starts and law. All simulators fly one number of robots in turns,
+flies `docs/bench/drivers/ring.py`: the same ring, starts and law. All simulators fly one number of robots in turns,
 each in a process that is warmed up; speeds are medians, ratios medians of the ratios of each turn.
 """
 
@@ -22,16 +22,16 @@ from operator import truediv
 from pathlib import Path
 
 from agents.user_folder import cache_folder
+from docs.bench.drivers import peer_zenpark, ring
 from experiments.file import document
-from tests.bench.drivers import peer_zenpark, ring
 from tests.bench.measuring import markdown
 from tests.bench.process import FLIGHT_S, process
 
 ROOT = Path(__file__).resolve().parents[2]
-DRIVERS = "tests.bench.drivers"
+DRIVERS = "docs.bench.drivers"
 ROBOTS = (7, 100, 1000)
 ROUNDS = 3
-MANY, SHORT_S = 500, 3.0  # so many robots fly plain for a shorter time [s]: a second takes one of CPU
+MANY, SHORT_S = 500, 3.0  # robots from which on plain flights are shorter [s]: a second takes one of CPU
 COMPILED_ROBOT_S = 2100.0  # robots × simulated time of a compiled flight [s]: ten seconds take milliseconds
 INSTALL_S = 600.0
 # threads of numpy gain nothing on arrays of this size, and would be charged
@@ -71,7 +71,7 @@ PEERS = {
     ),
     "irsim": Peer(
         "two wheels; collisions found and ignored",
-        "each robot is a Python object, whose shape is moved and entered into a tree",
+        "each robot is a Python object; its shape is moved and entered into a tree",
         (WHEELS, COMPILED_WHEELS), ("ir-sim",),
     ),
     "gym-pybullet-drones": Peer("rigid, 240 Hz", "", (RIGID,), ("gym-pybullet-drones",)),
@@ -157,7 +157,7 @@ def measured(name, robots, *arguments):
 
 @contextmanager
 def noting(troubles):
-    """What fails in the block is added to `troubles`."""
+    """Add the failure of the block to `troubles`."""
     try:
         yield
     except Failed as why:
@@ -235,7 +235,7 @@ def report(names, sizes=ROBOTS, rounds=ROUNDS):
 
 
 def main():
-    parser = argparse.ArgumentParser(prog="python -m tests.bench.peers", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(prog="python -m docs.bench.peers", description=__doc__.splitlines()[0])
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of: {', '.join([*OTHERS, ZENOH])}")
     parser.add_argument("--all", action="store_true", help="the ones with large downloads as well")
     parser.add_argument("--robots", type=int, nargs="+", default=ROBOTS)

@@ -1,20 +1,20 @@
-"""Growth of a run in virtual time with the number of robots: CPU time of an agent-step and of all around it, memory.
+"""Growth of a run in virtual time with the number of robots: CPU time of an agent-step and of the rest, memory.
 
-`python -m tests.bench.growth`: each number has processes of its own, plain and compiled, measured in turns with those
-of seven robots; figures are medians, and those that are no agent-steps of the compiled flights.
+`python -m docs.bench.growth`. Each number has processes of its own, plain and compiled, measured in turns with those
+of seven robots. Figures are medians; all but the agent-steps are of the compiled flights.
 """
 
 import statistics
 
-from tests.bench.drivers.peer_zenpark import DURATION_S
+from docs.bench.drivers.peer_zenpark import DURATION_S
+from docs.bench.peers import COMPILED_WHEELS, WHEELS, measured
 from tests.bench.measuring import markdown
-from tests.bench.peers import COMPILED_WHEELS, WHEELS, measured
 
 # simulated time [s] by number of robots: a compiled flight of seven takes milliseconds for ten seconds
 DURATIONS = {7: 300.0, 30: 70.0, 100: 21.0, 300: 10.0, 1000: 5.0, 3000: 3.0, 10_000: 3.0}
 COMPLETE = 300  # robots up to which metrics are taken as well
 ROUNDS = 3
-MANY = 1000  # so many and more are measured once
+MANY = 1000  # robots from which on a number is measured once
 SETTINGS = (WHEELS, COMPILED_WHEELS)
 COLUMNS = {  # figure of the driver: heading, format
     "read_s": ("read [s]", ".2f"),

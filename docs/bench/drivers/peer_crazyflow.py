@@ -8,7 +8,7 @@ import numpy as np
 from crazyflow.control import Control
 from crazyflow.sim import Sim
 
-from tests.bench.drivers import ring
+from docs.bench.drivers import ring
 
 BODY_HZ = 500
 HOVER = 0.8  # [m]

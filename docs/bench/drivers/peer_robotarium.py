@@ -5,7 +5,7 @@ from importlib.metadata import version
 import numpy as np
 from rps.robotarium import Robotarium
 
-from tests.bench.drivers import ring
+from docs.bench.drivers import ring
 
 
 def start(robots):

@@ -1,6 +1,6 @@
 """zenpark in virtual time: the agents with all their safety, their messages on the modelled network, and the bodies.
 
-python -m tests.bench.drivers.peer_zenpark ROBOTS KIND ENGINE plain|compiled SECONDS loop|all
+python -m docs.bench.drivers.peer_zenpark ROBOTS KIND ENGINE plain|compiled SECONDS loop|all
 """
 
 import math
@@ -8,12 +8,12 @@ import resource
 import sys
 import time
 
+from docs.bench.drivers import ring
 from experiments.file import document
 from experiments.metrics import measure as metrics
 from experiments.virtual_time import stretch
 from experiments.virtual_time.log import RunRecorder
 from experiments.virtual_time.simulation import VirtualRun
-from tests.bench.drivers import ring
 
 HZ = round(1.0 / ring.STEP_S)
 HOVER = {"crazyflie": ", hover = 0.8"}  # [m]
@@ -67,7 +67,7 @@ def measure(robots, kind, engine, evaluator, duration_s, *, complete=False):
     moment = flight.begin()
     start = time.process_time()
     flight.decide(moment)
-    flight.fly(landing=False, progress=lambda _: None, watch=None)
+    flight.fly(landing=False, progress=lambda _: None)
     end = time.process_time()
     ticks = round(duration_s * HZ)
     found = {"cpu_s": end - start, "agent_steps": ticks * robots, "read_s": loaded - begun, "start_s": start - loaded}

@@ -1,16 +1,16 @@
 """Measure everything again, and put the tables into `docs/results/peers.md`.
 
-python -m tests.bench            # an hour, and 7 GB in the user's cache
+python -m docs.bench            # an hour, and 7 GB in the user's cache
 """
 
 import re
 import time
 from pathlib import Path
 
+from docs.bench import growth, peers
 from experiments.recording.version import DIGEST_CHARACTERS, provenance
-from tests.bench import growth, peers
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "results" / "peers.md"
+PAGE = Path(__file__).resolve().parents[1] / "results" / "peers.md"
 
 
 def renewed(page, tables):

@@ -7,7 +7,7 @@ from pathlib import Path
 import irsim
 import numpy as np
 
-from tests.bench.drivers import ring
+from docs.bench.drivers import ring
 
 
 def start(robots):
