@@ -7,6 +7,7 @@ import pytest
 from tests.simulated.experiments import MIX
 from tests.simulated.faults import Fault
 from tests.simulated.laboratory import Flight, fly
+from tests.simulated.small import TRIO
 
 SPAN_S = 8.0
 pytestmark = pytest.mark.slow
@@ -115,6 +116,41 @@ def test_drone_found_aloft_is_down_when_done():
     assert (former.code, later.code) == (-9, 0)
     assert done[0] >= flight.robots["C"].off(after=4.1)
     assert flight.violations == []
+
+
+def test_world_lands_drone_of_frozen_process():
+    thawed = 8.0
+    flight = fly(MIX, Fault(0.5, "pause", "C", lasts=thawed - 0.5), case="world", settings=["duration_s=10"])
+    robot = flight.robots["C"]
+    assert robot.at(0.5 + 1.5).position[2] > 0.9 - 0.1, "it is held first"
+    assert 0.5 + 3.0 < robot.off(after=0.5) < thawed
+    assert next(each.reason for each in robot.phases if each.t > 0.5).startswith("it came down by itself")
+    assert robot.at(flight.ended).position[2] < 0.02
+    assert flight.code == 1
+
+
+def test_climbs_and_landings_continue_in_next_world():
+    climbing, landing = Fault(1.0, "kill", "world", since="ready"), Fault(0.4, "kill", "world", since="landing")
+    flight = fly(MIX, climbing, landing, case="world")
+    assert (flight.code, flight.violations) == (0, [])
+    event = flight.happened("world", text="started again")[-1]
+    assert {*event.text.rpartition("; ")[2].removesuffix(" where they were").split(", ")} == {*"ABC"}
+    for name, height in (("B", 0.6), ("C", 0.9)):
+        robot = flight.robots[name]
+        assert robot.at(-2.5).position[2] < 0.5 * height
+        assert robot.at(0.0).position[2] > height - 0.1
+        assert robot.at(event.t + 0.3).position[2] > height - 0.1, "it is where it was"
+        assert robot.phases[-1].reason == "finished"
+
+
+def test_centre_communicates_over_modelled_channel():
+    bad = ["channel.loss=0.3", "channel.delay_s=0.05", 'architecture="centralised"', "duration_s=20"]
+    (case,) = fly(TRIO, settings=[*bad, "rates.body_hz=50"]).metrics
+    centre, sent = case["guidance"], sum(robot["messages"] for robot in case["robots"])
+    assert (case["lost"], sent) == (0, 600), "of the network itself nothing is lost"
+    assert centre["poses_lost"] / sent == pytest.approx(0.3, abs=0.05)
+    assert centre["goals_lost"] / centre["goals"] == pytest.approx(0.3, abs=0.05)
+    assert 0.1 < centre["delay_mean_s"] < 0.25, "both ways, and up to a period of decisions"
 
 
 def test_recording_that_breaks_off_fails_the_run():

@@ -2,7 +2,6 @@
 
 import os
 import re
-import time
 from types import SimpleNamespace
 
 import pytest
@@ -171,22 +170,6 @@ def test_a_loop_that_hangs_is_landed_and_said(hanging, lonely, watcher):
     assert lonely.robot.process.poll() is None  # landed, not fallen
     lonely.robot.kill()
     lonely.world.kill()
-
-
-def test_process_frozen_aloft_is_landed_and_notices(lonely, watcher):
-    high, stopped = lonely.truths[-1].position[2], time.time()
-    lonely.robot.freeze()
-    lonely.until_down()
-    held = [truth.position[2] for truth in lonely.truths if stopped < truth.stamp < stopped + 1.5]
-    assert len(held) > 10
-    assert min(held) > high - 0.1  # and holds it first
-    again = messages.encode(messages.Order("takeoff"))
-    asked = watcher.session.get(watcher.keys.order("TE01"), payload=again, timeout=0.1)
-    assert not [reply for reply in asked if reply.ok is not None]
-    lonely.robot.thaw()
-    watcher.until(lambda: watcher.status["TE01"].reason == "it came down by itself", "it knows")
-    assert lonely.truths[-1].position[2] < 0.02
-    watcher.until_all("done", "TE01")
 
 
 def test_stop_behind_a_flood_of_deletions_is_obeyed(lonely, watcher):

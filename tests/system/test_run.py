@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from agents.network import messages
-from experiments.run import reopen
 from tests.commands import python
 from tests.runs import flown
 from tests.system.lab import NEAR_TRIANGLE, Flight, Watcher, options, typed
@@ -80,20 +79,6 @@ def test_receivers_lose_what_the_virtual_network_loses(tmp_path):
     assert np.mean(shares) == pytest.approx(0.3, abs=0.06 + lost / sent)
     assert (real.received.arrival - real.received.stamp).min() >= 0.05 - 1e-5
     assert real.dropped.sum() == pytest.approx(0.3 * sent, rel=0.15 + lost / sent)
-
-
-def test_centre_communicates_over_the_same_network(tmp_path):
-    changes = (*BAD, "duration_s=4", "architecture=centralised")
-    flight = Flight(tmp_path / "run", "triangle", "--case", "periodic", *changes)
-    assert flight.finish()[0] == 0, flight.said()
-    case = reopen(flight.folder).metrics["periodic"]
-    centre = case.guidance
-    assert case.lost == 0, "of the real network nothing is lost"
-    sent = sum(robot.messages for robot in case.robots)
-    assert centre.poses_lost / sent == pytest.approx(0.3, abs=0.07)
-    assert centre.goals_lost / centre.goals == pytest.approx(0.3, abs=0.15)
-    goals = flight.read("periodic").trace.goals
-    assert goals.delay.min() >= 0.1 - 1e-5, "both ways"
 
 
 AGREED = 0.15  # distance from the average, of signals that are up to 4 away from it

@@ -2,7 +2,6 @@
 
 import math
 import time
-from contextlib import ExitStack
 
 import numpy as np
 import pytest
@@ -114,34 +113,6 @@ def test_killed_world_is_restarted_and_robots_continue(tmp_path):
     middle = (when > 0.5) & (when < again + 0.4 - read.started) & known
     assert truth[middle][:, list(trace.robots).index("CF01"), 2].min() > 0.25, "it holds in the air"
     assert not [event for event in trace.events if event.kind == "robot" and "lost" in event.text]
-
-
-def test_climbs_and_landings_continue_in_the_next_world(router, watcher, three_file):
-    both = ("CF01", "TE01")
-
-    def heights():
-        return [watcher.state[name].position[2] for name in both]
-
-    def again(killed):
-        killed.kill()
-        made = worlds.enter_context(WorldProcess(router.endpoint, three_file))
-        assert "CF01" in made.ready.rpartition(";")[2], "it asks them where they were"
-        return made
-
-    with ExitStack() as worlds:
-        world = worlds.enter_context(WorldProcess(router.endpoint, three_file))
-        with RobotProcess(router.endpoint, three_file, *both):
-            watcher.until_all("ready", *both)
-            watcher.give(messages.Order("takeoff"), *both)
-            watcher.until(lambda: min(heights()) > 0.25, "they climb")
-            world = again(world)
-            watcher.until_all("airborne", *both)
-            assert min(heights()) > 0.54
-            watcher.give(messages.Order("land"), *both)
-            watcher.until(lambda: max(heights()) < 0.4, "they sink")
-            again(world)
-            watcher.until_all("done", *both)
-            assert max(heights()) < 0.06
 
 
 def test_pause_resume_and_reset(world, desk):
