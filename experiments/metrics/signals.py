@@ -440,7 +440,7 @@ class Measurement:
             last = int(outside[-1]) if len(outside) else 0
             settled = slice(0, last + 1)
             e, t = np.where(np.isfinite(error[settled]), error[settled], 0.0).sum(axis=1)[:, None], time[settled]
-            sent = int((trace.sent_by(i).stamp < time[last] - ROUNDING_S).sum())
+            sent = int((trace.sent_at[i] < time[last] - ROUNDING_S).sum())
             before, all_new = int(new[:last, i].sum()), int(new[:, i].sum())
             share = before / all_new if all_new else last / (len(time) - 1)
             effort = 0.02 * sent + 0.1 * share * int(trace.decisions[i]) + 0.3 * float(time[last] - time[0])
@@ -536,8 +536,7 @@ class Measurement:
         """Poses sent by each robot, by their running numbers, and those of them in the recording, (N,) each."""
         trace, rows = self.trace, range(len(self.trace.robots))
         recorded, rate = np.bincount(trace.sent.link, minlength=len(rows)), trace.plan.experiment.rates.pose_hz
-        poses = ((own.stamp.tolist(), own.seq.tolist()) for own in map(trace.sent_by, rows))
-        missing = [count_unrecorded(zip(*columns, strict=True), rate) for columns in poses]
+        missing = [count_unrecorded(trace.sent_at[i], trace.sent.seq[trace.sent_rows[i]], rate) for i in rows]
         return recorded + np.array(missing, dtype=np.intp), recorded
 
     @_kept
@@ -547,13 +546,13 @@ class Measurement:
         sent = self.transmissions[0]
         joined = np.zeros(len(sent)) if trace.joined is None else trace.joined
         present = np.maximum(time[-1] - np.maximum(joined, time[0]), time[1] - time[0])
-        early = np.array([(trace.sent_by(i).stamp < when).sum() for i, when in enumerate(joined)], dtype=np.intp)
+        early = np.array([(own < when).sum() for own, when in zip(trace.sent_at, joined, strict=True)], dtype=np.intp)
         return np.asarray((sent - early) / present)
 
     @_kept
     def gaps_between(self) -> list[Array]:
         """Times between the transmissions of each robot [s]."""
-        return [np.diff(np.sort(self.trace.sent_by(i).stamp)) for i in range(len(self.trace.robots))]
+        return [np.diff(np.sort(own)) for own in self.trace.sent_at]
 
     def gap(self, statistic: Callable[[Array], Any]) -> list[float | None]:
         """A statistic of these times of each robot [s]; None for fewer than two transmissions."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from itertools import pairwise
 from typing import Final, Literal, TypeVar
 
 import numpy as np
@@ -14,18 +13,18 @@ from agents.network.validation import missed, most_poses
 from agents.ticks import ROUNDING_S
 from experiments.definition.plan import Plan
 from experiments.recording.topics import SentPose
-from twins.arrays import Index
+from twins.arrays import Array, Index
 
 STATUS_S: Final = 1.0  # a status at most this much after the end of a run still counts for it
 
 
-def count_unrecorded(poses: Iterable[tuple[float, int]], rate: float) -> int:
-    """Poses that a robot sent between the recorded ones, given by stamp [s] and number in order of time.
+def count_unrecorded(stamp: Array, seq: Index, rate: float) -> int:
+    """Poses that a robot sent between the recorded ones, given by their stamps [s] and numbers in order of time.
 
     A robot transmits at most `rate` poses in a second [1/s]; see `agents.network.validation.missed`.
     """
-    gaps = ((before, last, then, seq) for (before, last), (then, seq) in pairwise(poses) if seq != last + 1)
-    return sum(missed(last, seq, then - before, rate) for before, last, then, seq in gaps)
+    gaps = np.flatnonzero(np.diff(seq) != 1).tolist()
+    return sum(missed(int(seq[k]), int(seq[k + 1]), float(stamp[k + 1] - stamp[k]), rate) for k in gaps)
 
 
 def count_lost(
@@ -46,9 +45,10 @@ def count_lost(
     total: Counter[str] = Counter()
     begin, end = run[0] - ROUNDING_S, run[1] + ROUNDING_S
     for robot, own, reports in zip(robots, poses, statuses, strict=True):
-        numbered = [(pose.stamp, pose.seq) for pose in own if begin <= pose.stamp <= end]
+        known = [pose for pose in own if begin <= pose.stamp <= end]
+        columns = np.array([pose.stamp for pose in known]), np.array([pose.seq for pose in known], dtype=np.intp)
         tails = sum(_tail(own, life, run, rate) for life in lives(reports, _made))
-        total[robot] += count_unrecorded(numbered, rate) + tails
+        total[robot] += count_unrecorded(*columns, rate) + tails
         total.update(_by_sender(reports, run, "lost"))
     return np.array([total[robot] for robot in robots], dtype=np.intp)
 

@@ -211,11 +211,13 @@ class Trace:
         }
         return data_frame(heads | {name: values.ravel() for name, values in self.columns().items()})
 
-    def sent_by(self, row: int) -> PoseTable:
-        return self.sent.take(self._sent_by_row[row])
+    @cached_property
+    def sent_at(self) -> list[Array]:
+        """Stamps of the poses that each robot sent [s], in their order."""
+        return [self.sent.stamp[which] for which in self.sent_rows]
 
     @cached_property
-    def _sent_by_row(self) -> list[Index]:
-        """Indices of the poses of each robot, in their order."""
+    def sent_rows(self) -> list[Index]:
+        """Rows of the poses of each robot in `sent`, in their order."""
         order = np.argsort(self.sent.link, kind="stable")
         return np.split(order, np.searchsorted(self.sent.link[order], np.arange(1, len(self.robots))))

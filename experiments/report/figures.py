@@ -367,7 +367,7 @@ def events(traces: Sequence[Trace], width: float = style.WIDTH) -> Figure:
 def _marks(trace: Trace, columns: int) -> list[tuple[Array, Array]]:
     """Beginnings and ends [s] of the marks of each robot, in a picture of `columns` columns."""
     pixel = max(float(trace.time[-1] - trace.time[0]), style.SHORTEST_S) / columns
-    pairs = [style.merged(np.sort(trace.sent_by(i).stamp), pixel) for i in range(len(trace.robots))]
+    pairs = [style.merged(np.sort(own), pixel) for own in trace.sent_at]
     return [(begin, end + pixel) for begin, end in pairs]
 
 
@@ -376,7 +376,7 @@ def _solid(trace: Trace, marks: Sequence[tuple[Array, Array]]) -> str:
     span = max(float(trace.time[-1] - trace.time[0]), style.SHORTEST_S)
     if not marks or any((end - begin).sum() < SOLID * span for begin, end in marks):
         return ""
-    rates = [len(trace.sent_by(i).stamp) / span for i in range(len(trace.robots))]
+    rates = [len(own) / span for own in trace.sent_at]
     low, high = f"{min(rates):.3g}", f"{max(rates):.3g}"
     rate = low if low == high else f"{low} to {high}"
     return f"{style.shortened(trace.case, LONGEST)}: every robot throughout, {rate} Hz"

@@ -49,7 +49,7 @@ class Film:
         self._newest: Index = np.maximum.accumulate(known, axis=0)  # (T, N) last sample with a position; −1: none yet
         held = np.take_along_axis(place, np.maximum(self._newest, 0)[..., None], axis=0)
         self._place: Array = np.where(self._newest[..., None] < 0, nan, held)  # silent robots stay where they were
-        self._sent: list[Array] = [np.sort(self.trace.sent_by(row).stamp) for row in range(len(self.trace.robots))]
+        self._sent: list[Array] = [np.sort(own) for own in self.trace.sent_at]
         self._ages: Array = TRAIL_S * np.arange(TRAIL, dtype=np.float64)
 
     def positions(self, times: Array) -> Array:

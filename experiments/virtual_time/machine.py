@@ -43,7 +43,7 @@ def machine(text: str, names: Sequence[str], *, often: bool = False) -> list[int
     Raises:
         NoCompilerError: If there is no compiler, or memory may not be executed.
     """
-    library = by_cc(text) if often else None
+    library = by_cc(text, make=often)
     if library is None:
         return in_memory(text, names)
     KEPT.append(library)
@@ -102,8 +102,8 @@ def _c_library() -> Any:
     return library if hasattr(library, "expm1") else ctypes.CDLL("libm.so.6")
 
 
-def by_cc(text: str) -> Any:
-    """Library of a program, made by `cc` or kept from before; None if that cannot be had."""
+def by_cc(text: str, *, make: bool = True) -> Any:
+    """Library of a program, kept from before, or made by `cc` if `make`; None if that cannot be had."""
     cc = shutil.which("cc")
     if cc is None:
         return None
@@ -111,6 +111,8 @@ def by_cc(text: str) -> Any:
     try:
         folder = private(cache_folder() / "programs")
         file = folder / f"{digest}.so"
+        if not make and not file.exists():
+            return None
         if not file.exists():
             source, made = file.with_suffix(".c"), file.with_suffix(".part")
             with source.open("a", encoding="utf-8") as written:

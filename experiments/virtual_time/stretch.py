@@ -32,6 +32,7 @@ from twins.body import TwinBody
 from twins.engines.engine import Touch
 
 TICK_S: Final = 15e-6  # [s] CPU time of a tick of a robot in plain Python: 10 to 20 µs
+AVOIDING_S: Final = 100e-6  # [s] likewise, with an avoidance that looks at many
 PAYS_S: Final = 0.3  # [s] work below which plain Python is quicker than to translate and compile
 OFTEN_S: Final = 20.0  # [s] following work for which a second of `cc` pays
 LONGEST: Final = 10_000  # ticks of a stretch
@@ -123,7 +124,8 @@ def stretches_of(flight: Flown, *, to_start: bool = False) -> Stretches | None:
 def plain_s(plan: Plan) -> float:
     """About the seconds that a flight takes in plain Python."""
     experiment = plan.experiment
-    return TICK_S * experiment.duration_s * experiment.rates.body_hz * len(experiment.robots)
+    tick_s = TICK_S if plan.avoidance is None else AVOIDING_S
+    return tick_s * experiment.duration_s * experiment.rates.body_hz * len(experiment.robots)
 
 
 def expect(seconds: float) -> None:

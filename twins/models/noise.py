@@ -60,8 +60,13 @@ class Noise:
             self.end = len(self.ahead)
 
     def _drawn(self, draws: int) -> array[float]:
-        drawn = self._generator.standard_normal((draws, len(self._scale))) * self._scale
-        return array("d", drawn.tobytes())
+        import numpy as np  # noqa: PLC0415 - as above
+
+        drawn = array("d", (0.0,)) * (draws * len(self._scale))
+        table = np.frombuffer(drawn).reshape(draws, len(self._scale))
+        self._generator.standard_normal(out=table)
+        table *= self._scale
+        return drawn
 
 
 def refill(*noises: Noise) -> None:

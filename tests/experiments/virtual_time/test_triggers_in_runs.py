@@ -62,7 +62,7 @@ def test_belief_error_is_that_of_the_prediction():
     held = dataclasses.replace(trace, plan=trace.plan.changed(trigger="send-on-delta"))
     assert np.nanmean(signals.belief_errors(held, net) ** 2) > 4.0 * np.nanmean(found**2)
     drone = trace.robots.index("CF02")
-    mine = trace.sent_by(drone)
+    mine = trace.sent.take(trace.sent_rows[drone])
     off = mine.position - trace.position[np.searchsorted(trace.time, mine.stamp - 1e-9), drone]
     assert 0.002 < np.sqrt((off[:, :2] ** 2).mean()) < 0.03  # what is sent is smoothed
 
