@@ -10,7 +10,7 @@ from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from itertools import accumulate, pairwise
-from math import copysign, cos, inf, isfinite, isnan, nan, pi, sin, sqrt, tau
+from math import copysign, cos, inf, isfinite, isnan, nan, sin, sqrt, tau
 from typing import Annotated, ClassVar, Final
 
 import msgspec
@@ -137,24 +137,6 @@ class Circle(Planner, frozen=True):
 
     def speed(self) -> float:
         return tau * abs(self.radius) / self.period_s
-
-
-class Lemniscate(Planner, frozen=True):
-    """Figure of eight (Gerono's lemniscate) through the robot's place, leaving along its heading."""
-
-    size: Annotated[Positive, Meta(description="half its length [m]")]
-    period_s: Annotated[Positive, Meta(description="one figure [s]")]
-
-    def target(self, elapsed: float, anchor: Vector, heading: float) -> Pose:
-        (x, y, z), angle = anchor, tau * elapsed / self.period_s
-        along, across = self.size * sin(angle), self.size * sin(angle) * cos(angle)
-        turn = heading - pi / 4.0  # the curve leaves its centre at 45 degrees
-        x += cos(turn) * along - sin(turn) * across
-        y += sin(turn) * along + cos(turn) * across
-        return x, y, z, nan
-
-    def speed(self) -> float:
-        return tau / self.period_s * self.size * sqrt(2.0)
 
 
 class Leg(msgspec.Struct, frozen=True):

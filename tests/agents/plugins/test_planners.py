@@ -1,7 +1,7 @@
 """Every registered planner: it starts where the robot is, never jumps, never asks for more than its speed."""
 
 from base64 import b64encode
-from math import atan2, cos, dist, hypot, inf, isnan, nan, pi, sin, sqrt
+from math import cos, dist, hypot, inf, isnan, nan, pi, sin, sqrt
 
 import msgspec
 import pytest
@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.plugins import registry
-from agents.plugins.planners import Circle, Hold, Itinerary, Leg, Lemniscate, Line, Waypoints
+from agents.plugins.planners import Circle, Hold, Itinerary, Leg, Line, Waypoints
 from tests.cases import examples
 
 POINTS = [[0.5, 0.5], [0.5, -0.5, 0.9], [-0.5, -0.5]]
@@ -23,7 +23,6 @@ PLANS = [
     {"kind": "waypoints", "points": [[0.2, 0.1]], "speed": 0.1, "loop": True},
     {"kind": "circle", "radius": 0.6, "period_s": 12.0},
     {"kind": "circle", "radius": -0.4, "period_s": 9.0, "turns": 1.25},
-    {"kind": "lemniscate", "size": 0.5, "period_s": 15.0},
     {
         "kind": "recorded",
         "file": "a.csv",
@@ -52,7 +51,7 @@ def test_starts_where_the_robot_is_within_its_speed(plan, anchor, heading, begin
     start, *path = places(planner, [0.0, *(begin + dt * k for k in range(60))], anchor, heading)
     assert start == pytest.approx(anchor, abs=1e-12)
     assert max(map(dist, path, path[1:])) <= planner.speed() * dt + 1e-9
-    if plan["kind"] in ("line", "circle", "lemniscate"):  # and no larger than needed
+    if plan["kind"] in ("line", "circle"):  # and no larger than needed
         first, second = places(planner, (0.0, 1e-4), (0.3, -0.2, 0.1), 0.7)
         assert dist(first, second) / 1e-4 == pytest.approx(planner.speed(), rel=1e-6)
 
@@ -73,7 +72,6 @@ WAYPOINTS = Waypoints(points=[[1.0, 0.0], [1.0, 2.0], [0.0, 2.0, 1.0]], speed_=0
         (Waypoints(points=SQUARE, speed_=0.5, loop=True), (2.0, 0.0, 0.3),
          {**LAP_S, 9.99: (0.995, 0.0, 0.3), 10.01: (1.0, 0.005, 0.3)}),
         (Circle(radius=0.5, period_s=4.0, turns=0.5), ORIGIN, dict.fromkeys((2.0, 50.0), (0.0, 1.0, 0.0))),
-        (Lemniscate(size=0.5, period_s=8.0), (0.2, 0.1, 0.8), dict.fromkeys((0.0, 4.0, 8.0), (0.2, 0.1, 0.8))),
     ],
 )  # fmt: skip
 def test_known_places_of_a_plan(planner, anchor, path):
@@ -90,7 +88,7 @@ def test_yaws_and_plans_that_stand():
 
 
 @pytest.mark.parametrize(("radius", "side"), [(0.6, 1.0), (-0.4, -1.0)])
-def test_circle_and_lemniscate_leave_along_the_heading(radius, side):
+def test_circle_leaves_along_the_heading(radius, side):
     plan, anchor, heading = Circle(radius=radius, period_s=10.0), (0.3, -0.2, 0.5), 0.7
     path = places(plan, [0.25 * k for k in range(41)], anchor, heading)
     centre = anchor[0] - radius * sin(heading), anchor[1] + radius * cos(heading), anchor[2]
@@ -99,9 +97,6 @@ def test_circle_and_lemniscate_leave_along_the_heading(radius, side):
     x, y = path[1][0] - anchor[0], path[1][1] - anchor[1]
     assert x * cos(heading) + y * sin(heading) > 0.0
     assert (y * cos(heading) - x * sin(heading)) * side > 0.0
-    loops = places(Lemniscate(size=0.5, period_s=8.0), [0.01 * k for k in range(801)], heading=heading)
-    assert max(dist(place, ORIGIN) for place in loops) == pytest.approx(0.5, abs=1e-9)
-    assert atan2(loops[1][1], loops[1][0]) == pytest.approx(heading, abs=1e-2)
 
 
 @pytest.mark.parametrize("radius", [None, 0.0, nan, inf])
