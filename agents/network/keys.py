@@ -92,6 +92,11 @@ class Keys:
         return f"{alive}/claim/{rank}"
 
     @staticmethod
+    def objection(alive: str, owner: str, session: str) -> str:
+        """Token with which the session `owner` keeps its name against `session`; as a claim it is later than all."""
+        return Keys.claim(alive, f"{session}/{owner}")
+
+    @staticmethod
     def rank_of(alive: str, token: str) -> str | None:
         """The `rank` in the token of a claim; None for any other token."""
         begin = Keys.claim(alive, "")

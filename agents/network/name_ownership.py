@@ -12,6 +12,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from math import inf
 from typing import Final
@@ -174,8 +175,29 @@ def confirm_ownership(
     raise network.Unreachable("asked to end before it was known whether the name has another owner")
 
 
+def rivals(alive: str, session: str, tokens: Iterable[str]) -> tuple[list[str], bool]:
+    """Sessions that own a name beside `session` and claimed it later, and whether an earlier owner objects to that one.
+
+    `tokens` are all below the liveliness key `alive`.
+    """
+    standing = set(tokens)
+    claims = sorted((each for each in standing if Keys.rank_of(alive, each) is not None), reverse=True)
+    claim = {Keys.session_of(each): each for each in claims}  # the earliest of each: an objection is later
+    if session not in claim:
+        return [], False
+    others = [each for each in claim if each != session and each and Keys.life(alive, each) in standing]
+    later = [each for each in others if claim[each] > claim[session]]
+    objected = any(Keys.objection(alive, each, session) in standing for each in others if each not in later)
+    return later, objected
+
+
 class OwnershipCheck:
-    """Check whether a process still owns its names, in a thread of its own: a loop polls the result."""
+    """Check whether a process still owns its names, in a thread of its own: a loop polls the result.
+
+    When a network that was split heals, a name may have two owners that never lost their routers. Each sees the token
+    of the other; the one with the earlier claim objects, and the other one gives way to the objection. A process that
+    was away does not object: the other one has taken a name that was free.
+    """
 
     def __init__(self, alive: Sequence[str], lease_s: float = LEASE_S, timing: OwnershipTiming = USUAL) -> None:
         """Begin when the names are owned: liveliness keys `alive`, in a session with the lease `lease_s` [s]."""
@@ -186,6 +208,9 @@ class OwnershipCheck:
         self._lost = False  # True if it had none, at any time since a look at which it was linked
         self._neighbours: set[str] = set()  # routers, or neighbours in a mesh, by their ids
         self._listener: zenoh.TransportEventsListener[None] | None = None
+        self._watches: list[zenoh.Subscriber[None]] = []
+        self._tokens: set[str] = set()  # tokens below the names
+        self._objections: dict[str, zenoh.LivelinessToken | None] = {}
         self.contested = False  # True if the last answer named another owner, which may still give way
         self._taken = ""
         self._asking: threading.Thread | None = None
@@ -223,8 +248,14 @@ class OwnershipCheck:
         if self._listener is None:
             callback = Callback(self._follow_links, indirect=False)
             self._listener = session.info.declare_transport_events_listener(callback, history=True)
-        self.linked = network.connected(session)
-        self._lost |= not self.linked
+            self._session = session
+            follow = Callback(self._follow_tokens, indirect=False)
+            self._watches = [
+                session.liveliness().declare_subscriber(Keys.lives(key), follow, history=True) for key in self._alive
+            ]
+        if self._lost or not self._neighbours:  # else the last event was that of a link
+            self.linked = network.connected(session)
+            self._lost |= not self.linked
         if back := self._lost and self.linked:
             self._lost = False
         return back
@@ -234,7 +265,7 @@ class OwnershipCheck:
         if self._lost and self._neighbours:
             self._lost = False
             self.begin(session)
-        return self.contested
+        return self.contested or bool(self._taken)
 
     def wait_while_checking(self, session: zenoh.Session, ended: Callable[[], bool]) -> bool:
         """Wait while a check runs; one begins if the process stood still since the last call, or was cut off until now.
@@ -262,6 +293,32 @@ class OwnershipCheck:
         else:
             self._neighbours.discard(str(event.transport.zid))
             self._lost |= not self._neighbours
+
+    def _follow_tokens(self, sample: zenoh.Sample) -> None:
+        """Settles the case of a name with two owners, in the receiving thread."""
+        token = str(sample.key_expr)
+        if sample.kind != zenoh.SampleKind.PUT:
+            self._tokens.discard(token)
+            return
+        self._tokens.add(token)
+        own_id = str(self._session.zid())
+        for key in self._alive:
+            later, objected = rivals(key, own_id, self._tokens)
+            if objected:
+                self._taken = key
+            elif later and (self._asking is not None or uptime() - self.awake_at >= self._stood_s):
+                self._lost = True  # it was away
+            elif not self._lost:
+                self._object([Keys.objection(key, own_id, each) for each in later])
+
+    def _object(self, objections: Sequence[str]) -> None:
+        def declare() -> None:
+            with suppress(zenoh.ZError):  # the session is closed
+                self._objections.update({each: pubsub.alive_token(self._session, each) for each in new})
+
+        if new := [each for each in objections if each not in self._objections]:
+            self._objections.update(dict.fromkeys(new))
+            threading.Thread(target=declare, name="objection", daemon=True).start()  # none is declared in a callback
 
     def _note(self, contested: bool) -> None:
         self.contested = contested
@@ -315,7 +372,7 @@ class NameKeeper:
             self.hands_off = True
             raise NameTaken(
                 f"{self._owners_text(taken)}: another process has taken this name while this one stood still or was "
-                "cut off; it leaves, and its body to the other one"
+                "cut off, or had it before on another side of a split network; it leaves, and its body to the other one"
             ) from None
 
     def declare(self, session: zenoh.Session, rows: Iterable[int]) -> None:

@@ -34,6 +34,7 @@ UNREAL: Final = (
     "drift",
     "capture",
     "corrupt",
+    "split",
 )  # docs/chaos.md says why
 KINDS: Final = tuple(kind for kind in scripted.KINDS if kind not in UNREAL)
 LENGTH: Final = "duration_s=15"  # length of a round, unless the user chooses another

@@ -44,6 +44,7 @@ def request_of(seed: int, name: str | None = None, kinds: Sequence[str] = ()) ->
         forgets=rng.choice((0.0, 0.0, 0.5)),
         drawn=seed,
         kinds=tuple(kinds),
+        sites=setting.sites,
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import random
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import dist
 from pathlib import Path
 
@@ -22,6 +22,7 @@ class Setting:
     experiment: str
     case: str | None = None
     settings: tuple[str, ...] = ()
+    sites: int = 0  # routers that run already
 
 
 def _mix(case: str) -> Setting:
@@ -51,14 +52,20 @@ LONG = {
     "mpc": Setting("mpc", "event", ("duration_s=10",)),
     "obstacle-course": Setting("obstacle-course", "event", ("duration_s=15",)),
 }
-NAMES = (*FIXED, *LONG, RANDOM)
+SITES = "random-sites"
+NAMES = (*FIXED, *LONG, "mix-sites", RANDOM, SITES)
 
 
 def setting_of(name: str, seed: int) -> Setting:
     """An experiment by its name; the random one is made from the seed."""
     if name == RANDOM:
         return Setting(make(random.Random(f"experiment {seed}")))
-    return FIXED.get(name) or LONG[name]
+    if name == SITES:
+        text = make(random.Random(f"experiment {seed}"))
+        return Setting(
+            "".join(line for line in text.splitlines(True) if not line.startswith("network.routers")), sites=2
+        )
+    return FIXED.get(name) or LONG.get(name) or replace(FIXED["mix-event"], sites=2)
 
 
 def make(rng: random.Random) -> str:

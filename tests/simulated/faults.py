@@ -25,6 +25,7 @@ class Fault:
     |---|---|---|
     | pause, kill, term | process | |
     | cut | process | the cable of its network is out |
+    | split | processes | nothing passes between them and all others; "second": those that are started by hand |
     | loss, duplicate, reorder | process | share of its messages that may be dropped |
     | slow | process | factor of its delays; 1 is 0.3 ms |
     | late | process | mean lateness of its sleeps [s] |
@@ -88,6 +89,21 @@ def _cut(world: World, fault: Fault) -> None:
     for session in world.sessions(fault.who):
         world.network.cut(session)
         world.after(fault.lasts, partial(world.network.cut, session, cut=False))
+
+
+def _split(world: World, fault: Fault) -> None:
+    words, network = fault.who.split(), world.network
+    names = {process.name for process in map(world.process, words) if process is not None}
+
+    def beyond(name: str) -> bool:
+        return name in names or name.partition(" ")[0] in words
+
+    def heal() -> None:
+        if network.beyond is beyond:  # no later split is there
+            network.split(None)
+
+    network.split(beyond)
+    world.after(fault.lasts, heal)
 
 
 def _spoil_link(world: World, fault: Fault) -> None:
@@ -181,6 +197,7 @@ KINDS: dict[str, Callable[[World, Fault], None]] = {
     "term": _terminate,
     "interrupt": _interrupt,
     "cut": _cut,
+    "split": _split,
     "loss": _spoil_link,
     "duplicate": _spoil_link,
     "reorder": _spoil_link,
@@ -209,6 +226,7 @@ WEIGHTS = {
     "corrupt": 1,
 }  # fmt: skip
 SINCE = {"start": 8, "launch": 2, "ready": 1, "landing": 1}  # how often a fault counts from a moment
+BEYOND = {"second": 0.6, "operator": 0.3, "conductor": 0.15, "recorder": 0.15, "world": 0.2}  # of a split: how often
 BUSY_S = {"launch": 3.0, "ready": 2.0, "landing": 2.0}  # time after it in which much happens
 OF_ANY = ("pause", "kill", "term", "cut", "loss", "slow", "late", "step")  # kinds that may hit any process
 COUNTS = (1, 2, 3, 5, 8, 12)
@@ -253,13 +271,15 @@ def draw(
     only: Sequence[str] = (),
     *,
     others: Sequence[str] = (),
+    sites: int = 0,
 ) -> list[Fault]:
     """A random script, sorted by time; half of them have few kinds and few victims, which meet more often.
 
-    `captured`: robots with a motion capture; `others`: further processes of the run that faults may hit.
+    `captured`: robots with a motion capture; `others`: further processes of the run that faults may hit; `sites`:
+    number of routers on machines of their own.
     """
     rng = random.Random(seed)
-    weights = {**WEIGHTS, **({"capture": 5} if captured else {})}
+    weights = {**WEIGHTS, **({"capture": 5} if captured else {}), **({"split": 6} if sites > 1 else {})}
     names, kinds = list(robots), [kind for kind in weights if not only or kind in only]
     count = rng.choice(COUNTS)
     if rng.random() < 0.5:
@@ -273,12 +293,12 @@ def draw(
 
 def draw_for(plan: Plan, seed: int, kinds: Sequence[str] = ()) -> list[Fault]:
     """A random script for the processes of an experiment."""
-    robots = plan.experiment.robots
+    robots, sites = plan.experiment.robots, len(plan.experiment.network.connect or ())
     captured = [name for name, robot in robots.items() if robot.position == "external" and robot.body != "world"]
-    others = [f"router{number}" for number in range(2, plan.experiment.network.routers + 1)]
+    others = [f"router{number}" for number in range(2, max(sites, plan.experiment.network.routers) + 1)]
     others += ["centre"] * (plan.experiment.architecture == "centralised")
     others += ["world"] * any(robot.body == "world" for robot in robots.values())
-    return draw(seed, plan.names, captured, plan.experiment.duration_s, kinds, others=others)
+    return draw(seed, plan.names, captured, plan.experiment.duration_s, kinds, others=others, sites=sites)
 
 
 def _draw_one(  # noqa: PLR0917 - as `draw`, which has made them
@@ -300,6 +320,9 @@ def _draw_one(  # noqa: PLR0917 - as `draw`, which has made them
         who = rng.choice(("recorder", "recorder", "conductor"))
     elif kind == "capture":
         who = rng.choice(captured)
+    elif kind == "split":
+        others = [each for each, share in BEYOND.items() if rng.random() < share]
+        who = " ".join(["router2", *others, *(name for name in names if rng.random() < 0.5)])
     elif kind in {"estop", "interrupt", "command"}:
         who = ""
     size = rng.choice(SIZES[kind]) if kind in SIZES else 1.0

@@ -41,7 +41,7 @@ def fly(request: Request) -> Flight:
             laboratory_world = world.World(running, script, varied=request.varied, clocks=request.clocks)
             laboratory_world.network.forgets = request.forgets
             checked = rules.Rules(laboratory_world)
-            laboratory_world.run(words, request.limit_s)
+            laboratory_world.run(words, request.limit_s, _sites(request))
             checked.judge(folder / "run")
             flight = _collect(laboratory_world, checked, request, folder / "run")
         flight.cpu_s = processes.REAL.process_time() - begun
@@ -82,15 +82,24 @@ def _file(request: Request, folder: Path) -> str:
 
 def _command(request: Request, file: str, folder: Path) -> list[str]:
     chosen = [] if request.case is None else ["--case", request.case]
-    settings = [word for setting in request.settings for word in ("--set", setting)]
+    settings = [word for setting in _settings(request) for word in ("--set", setting)]
     return ["run", file, *chosen, *settings, "--no-report", "--out", str(folder / "run"), *request.words]
+
+
+def _sites(request: Request) -> list[str]:
+    """Endpoints of routers that run already."""
+    return [f"tcp/127.0.0.1:{7447 + number}" for number in range(request.sites)]
+
+
+def _settings(request: Request) -> tuple[str, ...]:
+    return (*request.settings, *([f"network.connect={json.dumps(_sites(request))}"] if request.sites else []))
 
 
 def _script(request: Request, file: str) -> list[faults.Fault]:
     """The script, with random faults if some are drawn."""
     if request.drawn is None:
         return list(request.script)
-    plans = load(file, *request.settings).cases()
+    plans = load(file, *_settings(request)).cases()
     return faults.draw_for(plans[request.case or next(iter(plans))], request.drawn, request.kinds)
 
 

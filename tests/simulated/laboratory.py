@@ -59,6 +59,7 @@ class Request:
     folder: str | None = None
     drawn: int | None = None  # seed of a random script
     kinds: tuple[str, ...] = ()  # kinds of its faults; empty: all
+    sites: int = 0  # routers that run already, each on a machine of its own
 
 
 @dataclass(frozen=True)
@@ -219,6 +220,7 @@ def fly(
     words: Sequence[str] = (),
     folder: Path | None = None,
     limit_s: float = LIMIT_S,
+    sites: int = 0,
 ) -> Flight:
     """Fly an experiment with a script of faults: `./zenpark run` and all that it starts, on simulated time.
 
@@ -244,12 +246,13 @@ def fly(
         words: More words of the command, such as "--tag".
         folder: Where the run's folder is made and stays. Left out: nothing stays.
         limit_s: Of simulated time; what still runs then breaks the rule "hang".
+        sites: Number of routers that run already, linked with each other, instead of those of the run.
 
     Raises SimulatorError for a flight that gave no result.
     """
     request = Request(
         experiment, faults, seed, case, tuple(settings), mutant, preempt, varied, forgets, dict(clocks or {}), limit_s,
-        tuple(words), None if folder is None else str(folder),
+        tuple(words), None if folder is None else str(folder), sites=sites,
     )  # fmt: skip
     return run(request)
 

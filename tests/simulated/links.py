@@ -125,10 +125,12 @@ class Link:
         shown: Keys of tokens that the near end was told.
         asked: Questions that the near end has not answered yet.
         since: Time at which it was opened [s].
+        parted: True while the network is split between its ends; see `Network.split`.
     """
 
     def __init__(self, near: Node, far: Node) -> None:
         self.near, self.far, self.since = near, far, current().now
+        self.parted = False
         self.subscribers: dict[Any, str] = {}
         self.queryables: dict[Any, str] = {}
         self.tokens: dict[Any, str] = {}
@@ -145,6 +147,11 @@ class Link:
     def open(self) -> bool:
         """Whether both ends are open."""
         return all(self._open.values())
+
+    @property
+    def out(self) -> bool:
+        """Whether nothing passes now; it is held."""
+        return self.near.cut or self.far.cut or self.parted
 
     def other(self, node: Node) -> Node:
         return self.far if node is self.near else self.near
@@ -185,14 +192,14 @@ class Link:
         now = current().now
         for to in (self.near, self.far):
             sender = self.other(to)
-            if not (self.near.cut or self.far.cut or sender.process.paused):
+            if not (self.out or sender.process.paused):
                 self._silences[to] = 0
             elif not self._silences[to]:
                 number = self._silences[to] = next(self._counter)
                 beat_s = sender.lease_s / 4.0  # a sign of life is sent after this time without another message
                 heard = now - (now - self._sent[sender]) % beat_s
                 current().at(heard + sender.lease_s, to.process.call, self._expire, to, number)
-        if not (self.near.cut or self.far.cut):
+        if not self.out:
             current().after(FLUSH_S, self._flush)
 
     def _expire(self, to: Node, number: int) -> None:
@@ -200,7 +207,7 @@ class Link:
             self.close(to)
 
     def _arrive(self, to: Node, call: Callable[..., object], args: tuple[Any, ...]) -> None:
-        if self.near.cut or self.far.cut or self._held[to]:
+        if self.near.cut or self.far.cut or self.parted or self._held[to]:
             self._held[to].append((call, args))
         elif not self._open[to]:
             return
@@ -215,7 +222,7 @@ class Link:
             call(*args)
 
     def _flush(self) -> None:
-        if not (self.near.cut or self.far.cut):
+        if not self.out:
             for to, held in self._held.items():
                 self._held[to] = []
                 for call, args in held:

@@ -132,9 +132,9 @@ class Look:
             return False
         session = self.world.session(process)
         link = None if session is None else session.link
-        if session is None or link is None or not link.open() or session.cut or (session.slow >= 100 and not slowly):
+        if session is None or link is None or not link.open() or (session.slow >= 100 and not slowly):
             return False
-        return not (link.far.cut or link.far.process.paused)
+        return not (link.out or link.far.process.paused)
 
     @cached_property
     def kinds(self) -> set[str]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Callable, Mapping, Sequence
+from math import inf
 from types import SimpleNamespace
 from typing import Any, Final, Self
 
@@ -27,10 +28,16 @@ SETTINGS: Final = (
 ROUTER, CLIENT = zenoh.WhatAmI.ROUTER, zenoh.WhatAmI.CLIENT
 
 
+def _nobody(_: str) -> bool:
+    return False
+
+
 class Network:
     """All nodes, with the endpoints that routers listen on.
 
     Attributes:
+        beyond: Whether the process of a name is on the far side of a split.
+        healed: Time at which the last split healed [s].
         forgets: Probability that a question for tokens, of a session that watches the same keys, has an empty answer
             (`findings/zenoh-liveliness-get-beside-subscriber.sh`).
     """
@@ -40,6 +47,8 @@ class Network:
         self.routers: list[Router] = []
         self.numbers = itertools.count(1)
         self.forgets = 0.0
+        self.beyond: Callable[[str], bool] = _nobody
+        self.healed = -inf
 
     def open(self, config: zenoh.Config) -> Session | Router:
         """A node with settings of `agents.network.zenoh_config`; raises ZError if no router answers."""
@@ -55,6 +64,19 @@ class Network:
         """Pull the cable of a node out, or plug it in again."""
         node.cut = cut
         node.suspend()
+
+    def split(self, beyond: Callable[[str], bool] | None) -> None:
+        """Let nothing pass between processes that are `beyond`, by their names, and all others; None: it heals."""
+        if beyond is None:
+            self.healed = current().now
+        self.beyond = beyond or _nobody
+        for link in {id(link): link for node in (*self.sessions, *self.routers) for link in node.links}.values():
+            link.parted = self.parts(link.near, link.far)
+            link.look()
+
+    def parts(self, one: Node, other: Node) -> bool:
+        """Whether a split is between two nodes."""
+        return self.beyond(one.process.name) != self.beyond(other.process.name)
 
     @property
     def serving(self) -> bool:
@@ -118,7 +140,7 @@ class Router(Node):
             while not self.closed:
                 block(SHAKE_S)
                 other = self.network.at(endpoint)
-                if other is not None and not self.silent and not other.silent:
+                if other is not None and not (self.silent or other.silent or self.network.parts(self, other)):
                     link = Link(self, other)
                     self.peers.append(link)
                     other.peers.append(link)
@@ -143,7 +165,7 @@ class Router(Node):
         """A client has connected."""
         self.clients.append(link)
 
-    def _next(self, target: Router) -> Link | None:
+    def path_to(self, target: Router) -> Link | None:
         """Link with a router, or with one that is linked with it."""
         for link in self.peers:
             if link.other(self) is target:
@@ -157,13 +179,13 @@ class Router(Node):
 
     def _reached(self) -> list[Router]:
         """The router itself, and those that it is linked with."""
-        return [self, *(each for each in self.network.routers if each is not self and self._next(each) is not None)]
+        return [self, *(each for each in self.network.routers if each is not self and self.path_to(each) is not None)]
 
     def relay(self, target: Router, call: Callable[..., object], *args: Any) -> None:
         """Call a function at another router, or here."""
         if target is self:
             call(*args)
-        elif (link := self._next(target)) is not None:
+        elif (link := self.path_to(target)) is not None:
             neighbour = link.other(self)
             assert isinstance(neighbour, Router)
             link.send(self, neighbour.relay, target, call, *args)
@@ -350,7 +372,7 @@ class Session(Node):
             while (router := self.network.at(endpoint)) is not None and current().now - begun < self._limit_s:
                 if self.closed:
                     return False
-                if not self.silent and not router.silent:
+                if not (self.silent or router.silent or self.network.parts(self, router)):
                     self._begin(router)
                     return True
                 block(LOOK_S)

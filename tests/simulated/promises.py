@@ -39,6 +39,8 @@ RUN = "simulated/test_runs.py::test_exit_code"
 CHECK = "experiments/check/test_check.py::test_"
 MEASURED = "measured: docs/results/network.md"
 FAILING = f"{HAZARDS} agents/safety/test_detection.py::test_failing_control_loop"
+BEYOND = "robots_beyond_are_lost_and_found"
+SPLIT = "simulated/test_split.py::test_"
 FROZEN = f"{HOST}frozen_robot_is_ordered_down_then_killed"
 CUT = f"{MACHINES}machine_cut_off_lands_its_robots_only"
 EXAMPLE = "an example of an output"
@@ -142,6 +144,14 @@ HOSTS: Final = {
     "(those on the launcher's machine after 3 s)": f"{HOST}frozen_launcher_lands_all_and_gives_no_order",
     "processes end 12 s later at the latest": f"{MACHINES}machine_cut_off_lands_its_robots_only",
     "land 3 s after the planned end, counts as lost 15 s later": FROZEN,
+    "hold 1.3 to 1.8 s after the split": f"{SPLIT}robots_go_to_the_router_of_their_side",
+    "side, 3 s after it": f"{SPLIT}robots_go_to_the_router_of_their_side",
+    "lost after 2 s at the latest, and left out 1 s later": f"{SPLIT}{BEYOND}",
+    "0.15 s after the split in": f"{SPLIT}{BEYOND}",
+    "absent for a second. In": f"{SPLIT}{BEYOND}",
+    "warn 2 s after its token": f"{SPLIT}conductor_beyond_is_missed_and_the_robots_finish",
+    "At most 0.15 s after that (0.11 s with": f"{SPLIT}of_two_owners_the_later_one_ends",
+    "any more, and ends with 2.": f"{SPLIT}of_two_owners_the_later_one_ends",
     "to all robots within 1 s": f"{MACHINES}estop_typed_on_a_machine_stops_all",
     "signals and the exit code on": "experiments/real_time/processes/test_zygote.py::test_exit_codes_are_passed_on",
     "(± 0.05 ms here)": MEASURED,

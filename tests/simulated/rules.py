@@ -20,6 +20,7 @@ from tests.simulated.world import LOOK_S, World
 
 LIES = {"body", "capture", "step"}  # faults that let a robot believe what is not true
 OF_LINKS = {"loss", "duplicate", "reorder"}  # faults under which orders are repeated until they are obeyed
+HEALED_S = 0.5  # time after a split in which its routers find each other, and the later of two owners learns of it
 HELD = ("hold", "land", "cut")  # worst hazards with which a robot does not go on
 
 
@@ -269,6 +270,15 @@ def contact(look: Look, one: Seen, other: Seen) -> str:
     return f"touches {other.name}, {p} {q}" if beside and level and excused not in look.since else ""
 
 
+def _apart(look: Look, process: Process, other: Process) -> bool:
+    """Whether a split is between two processes that have routers, or has just healed."""
+    one, two = (session and session.link for session in map(look.world.session, (process, other)))
+    if one is None or two is None or one.far is two.far:
+        return False
+    link = one.far.path_to(two.far)
+    return link is None or link.out or look.now - max(link.since, look.world.network.healed) < HEALED_S
+
+
 def _second_voice(look: Look, name: str, process: Process) -> str:
     """Newer processes that drive the robot of an older one, though both are on the network."""
     newer = look.world.drivers.get(name)
@@ -281,7 +291,7 @@ def _second_voice(look: Look, name: str, process: Process) -> str:
     session = look.world.session(process)
     fresh = session is not None and session.link is not None and look.now <= session.link.since
     woken = process.resumed_at > look.now - 1.0 and process.resumed_at - process.paused_at > 0.7
-    both = not fresh and (look.linked(other) or woken)
+    both = not fresh and ((look.linked(other) and not _apart(look, process, other)) or woken)
     return f"by process {process.pid}, {look.now - at:.3f} s after {other.pid}" if both else ""
 
 

@@ -5,7 +5,7 @@ from functools import partial
 import pytest
 
 from tests.cases import mostly_slow
-from tests.simulated import laboratory, test_changes, test_hosts, test_runs, test_safety
+from tests.simulated import laboratory, test_changes, test_hosts, test_runs, test_safety, test_split
 from tests.simulated.laboratory import Mutant
 
 LIMIT_S = 45.0  # longest flight of a script, and twice the time to land
@@ -49,7 +49,7 @@ MUTANTS = {
     ),
     "empty answer not asked for again": (
         OWNERSHIP, "if tokens or tokens is None:", "if True:",
-        partial(test_safety.test_two_robots_of_a_process_keep_their_names, 2),
+        partial(test_safety.test_two_robots_of_a_process_keep_their_names, 1),
     ),
     "stop left to the loop": (
         LOOP, "        if self._opened:\n            self._body.stop", "        if False:\n            self._body.stop",
@@ -184,6 +184,14 @@ MUTANTS = {
         "norm(position[:, i + 1 :])", run("shortly_held"),
     ),
     "long hold is no matter": (MEASURE, "if ordered > HELD * end:", "if ordered > end:", run("held")),
+    "two owners for good": (
+        OWNERSHIP, "                self._taken = key\n", "                pass\n",
+        partial(test_split.test_of_two_owners_the_later_one_ends, "second process"),
+    ),
+    "owner that was away objects": (
+        OWNERSHIP, "or uptime() - self.awake_at >= self._stood_s):", "):",
+        partial(test_split.test_owner_that_was_away_does_not_object, 5.0, 0.9),
+    ),
     "suspension unnoticed": (
         LOOP, "if missed * self._dt > self._setup.loop_timeout_s:", "if missed * self._dt > 99.0:",
         test_safety.test_suspended_robot_holds_until_it_hears,
@@ -194,7 +202,7 @@ MUTANTS = {
 @pytest.mark.parametrize("name", mostly_slow(MUTANTS, 2))
 def test_script_finds_the_mutant(name, monkeypatch):
     file, old, new, script = MUTANTS[name]
-    for module in (test_changes, test_hosts, test_runs, test_safety):
+    for module in (test_changes, test_hosts, test_runs, test_safety, test_split):
         monkeypatch.setattr(module, "fly", partial(laboratory.fly, mutant=Mutant(file, old, new), limit_s=LIMIT_S))
     with pytest.raises((AssertionError, ValueError, IndexError, StopIteration)):
         script()

@@ -168,11 +168,12 @@ def test_second_process_ends_without_a_command():
 
 def test_two_processes_that_claim_a_name_at_once():
     """The later one began a hundred seconds earlier, by its clock."""
-    both = Fault(1.0, "twice", "C", 0.0), Fault(1.0018, "twice", "C", -100.0)
+    both = Fault(1.0, "twice", "C", 0.0), Fault(1.001, "twice", "C", -100.0)
     flight = fly(TRIO, Fault(0.5, "kill", "C"), *both, settings=["duration_s=4"])
     robot, seconds = flight.robots["C"], flight.of("second C")
     drivers = {pid for t, pid in (*robot.poses, *robot.commands) if t > 1.0}
     assert drivers == {each.pid for each in seconds if each.code != 2}
+    assert ["on the network already" in each.output for each in seconds if each.pid not in drivers] == [True]
     assert (len(drivers), flight.violations) == (1, [])
 
 

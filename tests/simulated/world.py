@@ -10,6 +10,7 @@ import functools
 import importlib
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 
 LOOK_S = 0.05  # period of samples and rules
 END_S = 0.05  # time after the end of the last process
-OUTSIDE = ("operator", "capture", "second ")  # processes that no run has started
+OUTSIDE = ("operator", "capture", "second ", "site-")  # processes that no run has started
 
 _world: World | None = None
 
@@ -113,8 +114,15 @@ class World:
 
     # ------------------------------------------------------------------ the run
 
-    def run(self, words: Sequence[str], limit_s: float) -> None:
-        """Run `./zenpark run` with these words, until all processes of the run have ended, or for `limit_s` [s]."""
+    def run(self, words: Sequence[str], limit_s: float, sites: Sequence[str] = ()) -> None:
+        """Run `./zenpark run` with these words, until all processes of the run have ended, or for `limit_s` [s].
+
+        A router runs already at each endpoint of `sites`, linked with those before it.
+        """
+        for row, site in enumerate(sites):
+            links = [word for each in sites[:row] for word in ("--connect", each)]
+            command = partial(main, "agents.runtime.router", ["--listen", site, *links])
+            sim.Process(f"site-router{row + 1 if row else ''}", command)
         self.conductor = sim.Process("conductor", lambda: main("tools.guard", words))
         self._close_pipes_at_exit(self.conductor)
         self._schedule("launch")

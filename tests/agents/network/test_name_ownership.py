@@ -405,6 +405,52 @@ def test_empty_answer_tells_nothing_of_owners(empty):
     assert len(asked) == empty + len(answers)
 
 
+def owner(session: str, began: float) -> list[str]:
+    return [Keys.life(KEY, session), Keys.claim(KEY, Keys.rank(began, session))]
+
+
+@pytest.mark.parametrize(
+    ("tokens", "found"),
+    [
+        ([], ([], False)),
+        (owner("beef", 2.0), (["beef"], False)),
+        (owner("beef", 2.0)[:1], ([], False)),
+        (owner("beef", 2.0)[1:], ([], False)),
+        ([*owner("beef", 2.0), Keys.objection(KEY, "beef", "f00d")], (["beef"], False)),
+        (owner("beef", 0.5), ([], False)),
+        ([*owner("beef", 0.5), Keys.objection(KEY, "beef", "f00d")], ([], True)),
+        ([*owner("beef", 0.5), Keys.objection(KEY, "beef", "cafe")], ([], False)),
+        ([Keys.objection(KEY, "beef", "f00d")], ([], False)),
+    ],
+)
+def test_earlier_of_two_owners_stays(tokens, found):
+    """Another session is an owner with both of its tokens; a stranger's objection is none."""
+    assert name_ownership.rivals(KEY, "f00d", [KEY, *owner("f00d", 1.0), *tokens]) == found
+    assert name_ownership.rivals(KEY, "f00d", tokens) == ([], False)
+
+
+@pytest.mark.parametrize(("began", "away"), [(2.0, False), (2.0, True), (0.5, False)])
+def test_owner_objects_to_a_later_one(began, away, monkeypatch):
+    clock, net = ManualClock(), Net()
+    monkeypatch.setattr(name_ownership, "uptime", clock.monotonic)
+    with net.worn():
+        net.session.info.routers_zid = lambda: ["r"]
+        check = name_ownership.OwnershipCheck([KEY], network.ROBOT_LEASE_S)
+        assert not check.check_return(net.session)
+        clock.sleep(0.7 * away)
+        for token in (*owner("f00d", 1.0), *owner("beef", began)):
+            check._follow_tokens(Sample(token, "", b""))
+        until(lambda: not any(thread.name == "objection" for thread in threading.enumerate()))
+        assert (Keys.objection(KEY, "f00d", "beef") in net.tokens) == (began == 2.0 and not away)
+        assert check.check_return(net.session) == (began == 2.0 and away)
+        assert check.finished()
+        check._follow_tokens(Sample(Keys.objection(KEY, "beef", "f00d"), "", b""))
+        if began == 0.5:
+            with pytest.raises(NameTaken):
+                check.finished()
+        assert check.is_contested(net.session) == (began == 0.5)
+
+
 @pytest.mark.mechanism("name ownership")
 @pytest.mark.system
 def test_real_router_knows_owners_of_names(patient_router: RouterProcess):
