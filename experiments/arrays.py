@@ -51,7 +51,7 @@ class ArrayTable(msgspec.Struct, frozen=True):
     def __len__(self) -> int:
         return len(msgspec.structs.astuple(self)[0])
 
-    def take(self, which: Index | Mask) -> Self:
+    def take(self, which: Index | Mask | slice) -> Self:
         kept: list[Any] = [None if column is None else column[which] for column in msgspec.structs.astuple(self)]
         return type(self)(*kept)
 

@@ -120,9 +120,12 @@ def in_run(time: Array, duration: float) -> Mask:
 
 def poses_in_run(table: PoseTable, duration: float, by: Literal["stamp", "arrival"]) -> PoseTable:
     """Poses that were sent (`stamp`) or received (`arrival`) in a run of `duration` [s], in order of that time."""
-    kept = table.take(in_run(getattr(table, by), duration))
-    times = np.maximum(getattr(kept, by), 0.0)
-    return msgspec.structs.replace(kept, **{by: times}).take(np.argsort(times, kind="stable"))
+    times = np.maximum(getattr(table, by), 0.0)
+    which = np.flatnonzero(in_run(getattr(table, by), duration))
+    which = which[np.argsort(times[which], kind="stable")]
+    whole = len(which) > 0 and (np.diff(which) == 1).all()  # no copy then: of many robots it is large
+    kept = table.take(slice(which[0], which[-1] + 1) if whole else which)
+    return msgspec.structs.replace(kept, **{by: np.maximum(getattr(kept, by), 0.0)})
 
 
 @dataclass(frozen=True, eq=False)

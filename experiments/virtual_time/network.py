@@ -210,12 +210,10 @@ class VirtualNetwork:
 
     def logged(self, begin: float) -> dict[str, Any]:
         """Columns of the log, see `experiments.virtual_time.simulation.Log`; the common start is at `begin` [s]."""
-        received = self._received.table(begin)
-        received = received.take(np.lexsort((received.link, received.arrival)))  # same order as in a recording
         return {
             "sent": self._sent.table(begin, bare=self._lean),
             "says": self.says,
-            "received": replace(received, yaw=None),
+            "received": self._received.table(begin, ordered=True),
             "lost": np.array(self._channel.dropped, dtype=np.intp),
             "centre": None if self.centre is None else self.centre.logged(begin),
         }
@@ -248,29 +246,30 @@ class VirtualNetwork:
         sent = np.frombuffer(ledger.sent)[: ledger.count * ledger.wide].reshape(-1, ledger.wide)
         sent = sent[np.lexsort((sent[:, 0], sent[:, 2]))]  # robots of a kind are flown together
         sent, words = sent[:, :SENT], sent[:, SENT:]
-        self._sent.extend(sent, sent[:, 2], sent[:, 0], words.tolist() if self.says and not self._lean else ())
+        self._sent.extend(sent, sent[:, 2], sent[:, 0].astype(np.intp))
+        if self.says and not self._lean:
+            self._sent.extra += words.tolist()
         if not self._lean:
             self._receive_all(ways, sent, before, t)
 
     def _receive_all(self, ways: Sequence[LinkQueue], sent: Array, before: Sequence[Arrived], t: float) -> None:
         """Note what was received until `t` [s] of what was `sent` (K, 10), and of what was under way `before`."""
         first = np.array([_row(sample) for _, _, sample in before]).reshape(-1, SENT)
-        links = [np.array([link for link, _, _ in before], dtype=float)]
+        links = [np.array([link for link, _, _ in before], dtype=np.intp)]
         arrivals = [np.array([arrival for _, arrival, _ in before], dtype=float)]
-        rows = [first]
-        by_row = sent[np.argsort(sent[:, 0], kind="stable")]
-        begins = np.searchsorted(by_row[:, 0], np.arange(len(self._robots) + 1)).tolist()
+        rows = [np.arange(len(first))]
+        order = np.argsort(sent[:, 0], kind="stable")
+        begins = np.searchsorted(sent[order, 0], np.arange(len(self._robots) + 1)).tolist()
         for link, (robot, k) in enumerate(self.receivers):
             sender = robot.neighbours.all[k].sender
-            part = by_row[begins[sender] : begins[sender + 1]]
-            rows.append(part)
-            links.append(np.full(len(part), float(link)))
-            arrivals.append(np.array(ways[link].arrivals[: len(part)]))
-        every, on = np.concatenate(rows), np.concatenate(links)
+            which = order[begins[sender] : begins[sender + 1]]
+            rows.append(len(first) + which)
+            links.append(np.full(len(which), link))
+            arrivals.append(np.array(ways[link].arrivals[: len(which)]))
         arrival = np.concatenate(arrivals)
-        order = np.lexsort((on, every[:, 0], every[:, 2], arrival))
-        order = order[arrival[order] <= t + ROUNDING_S]
-        self._received.extend(every[order], arrival[order], on[order])
+        known = arrival <= t + ROUNDING_S
+        on, every = np.concatenate(links)[known], np.concatenate(rows)[known]
+        self._received.extend(np.concatenate([first, sent]), arrival[known], on, every)
 
 
 def _row(sample: Sample) -> tuple[float, ...]:
@@ -283,38 +282,49 @@ class _Samples:
 
     def __init__(self, extra: int = 0) -> None:
         """`extra`: how many more numbers each sample has."""
-        self._parts: list[Array] = []  # (K, 12): link, arrival [s], and the numbers of a sample
+        # link (K,), arrival (K,) [s], and numbers of samples (M, 10), with the row of each in them (K,)
+        self._parts: list[tuple[Index, Array, Array, Index | slice]] = []
         self._last: list[tuple[float, ...]] = []
-        self._width, self._extra = extra, list[tuple[float, ...]]()
+        self._width, self.extra = extra, list[Sequence[float]]()
 
     def add(self, link: int, arrival: float, sample: Sample, extra: tuple[float, ...] = ()) -> None:
         self._last.append((float(link), arrival, *_row(sample)))
         if extra:
-            self._extra.append(extra)
+            self.extra.append(extra)
 
-    def extend(self, samples: Array, arrival: Array, link: Array, extra: Sequence[tuple[float, ...]] = ()) -> None:
-        """Add samples (K, 10) with their `arrival` (K,) [s] and `link` (K,)."""
+    def extend(self, samples: Array, arrival: Array, link: Index, which: Index | slice = slice(None)) -> None:
+        """Add samples with their `arrival` (K,) [s] and `link` (K,): those rows `which` (K,) of `samples` (M, 10)."""
         self._settle()
-        self._extra += extra
-        self._parts.append(np.column_stack([link, arrival, samples]))
+        self._parts.append((link, arrival, samples, which))
 
     def _settle(self) -> None:
         if self._last:
-            self._parts.append(np.array(self._last))
-            self._last = []
+            rows, self._last = np.array(self._last), []
+            self._parts.append((rows[:, 0].astype(np.intp), rows[:, 1], rows[:, 2:], slice(None)))
 
-    def table(self, begin: float, *, bare: bool = False) -> PoseTable:
-        """A table with times since the common start at `begin` [s]; `bare`: numbers and times alone."""
+    def table(self, begin: float, *, bare: bool = False, ordered: bool = False) -> PoseTable:
+        """A table with times since the common start at `begin` [s].
+
+        Args:
+            bare: Numbers and times alone.
+            ordered: In the order of a recording, and without yaws.
+        """
         self._settle()
-        all_of_them = np.concatenate([np.zeros((0, SENT + 2)), *self._parts])
-        nothing = np.zeros((len(all_of_them), 0))
+        link, arrival = (np.concatenate([np.zeros(0), *(part[k] for part in self._parts)]) for k in (0, 1))
+        order: Index | slice = np.lexsort((link, arrival - begin)) if ordered else slice(None)
+
+        def column(what: int | slice) -> Array:
+            parts = [samples[which, what] for *_, samples, which in self._parts]
+            return np.concatenate([np.zeros((0, SENT))[:, what], *parts])[order]
+
+        nothing = np.zeros((len(link), 0))
         return PoseTable(
-            all_of_them[:, 0].astype(np.intp),
-            all_of_them[:, 3].astype(np.intp),
-            all_of_them[:, 4] - begin,
-            all_of_them[:, 1] - begin,
-            nothing if bare else all_of_them[:, 5:8],
-            nothing if bare else all_of_them[:, 8:11],
-            None if bare else all_of_them[:, 11],
-            extra=np.array(self._extra).reshape(-1, self._width) if self._width else None,
+            link[order].astype(np.intp),
+            column(1).astype(np.intp),
+            column(2) - begin,
+            arrival[order] - begin,
+            nothing if bare else column(slice(3, 6)),
+            nothing if bare else column(slice(6, 9)),
+            None if bare or ordered else column(9),
+            extra=np.array(self.extra).reshape(-1, self._width) if self._width else None,
         )
