@@ -14,7 +14,7 @@ from agents.plugins.files import plain
 from experiments.check import motion, noise, safety, surroundings, theory
 from experiments.check.analysis import Analysis
 from experiments.check.findings import FORGIVEN, MARK, NOT_RANDOM, CheckNumbers, Finding, first_of_each_code
-from experiments.check.ideal_run import isolated, predict, ticking_plugins, uncompiled
+from experiments.check.ideal_run import predict, ticking_plugins, uncompiled
 from experiments.check.realisation import algebraic_connectivity
 from experiments.definition import standby
 from experiments.definition.graph import edges
@@ -41,7 +41,7 @@ def compilation(analysis: Analysis) -> Iterator[Finding]:
     plan = analysis.plan
     foreign = [each for each in ticking_plugins(plan) if each.__module__.partition(".")[0] != "agents"]
     if foreign and machine.works():
-        text, gain = uncompiled(isolated(plan).changed(avoidance=plan.experiment.avoidance))
+        text, gain = uncompiled(analysis.prediction.bare.changed(avoidance=plan.experiment.avoidance))
         cost = f"runs in virtual time and sweeps take {'2 to 8' if gain > 1.0 else '8 to 12'} times as long"
         message = f"{plain(text)}, which is not compiled: {cost} (docs/plugins.md, the subset)"
         yield from [Finding("remark", "uncompiled", message)] if text else ()

@@ -36,6 +36,7 @@ REPETITIONS: Final = 5  # flights with noise, each with another seed
 class Prediction:
     """Predicted motion: positions at each decision."""
 
+    bare: Plan  # flown experiment, see `isolated`
     time: Array  # (T,) [s] after the common start
     position: Array  # (T, N, 3) [m]
     transmissions: int  # number of all robots in the run
@@ -129,11 +130,11 @@ def fly(bare: Plan, seed: int, *, quiet: bool = False) -> Prediction:
     except conductor.Stuck as stuck:
         position = np.array(bare.start_poses()[0])
         position[:, 2] = [robot.hover or 0.0 for robot in bare.experiment.robots.values()]
-        return Prediction(np.zeros(1), position[None], transmissions=0, messages_hz=0.0, stuck=str(stuck))
+        return Prediction(bare, np.zeros(1), position[None], transmissions=0, messages_hz=0.0, stuck=str(stuck))
     run, duration_s = log.time >= -ROUNDING_S, bare.experiment.duration_s
     begun = tuple(each for each in log.incidents if each[1].outcome > Outcome.NONE and 0.0 <= each[1].time < duration_s)
     sent = len(poses_in_run(log.sent, duration_s, "stamp"))
-    return Prediction(log.time[run], log.true_position[run], sent, sent / duration_s, begun, log.velocities)
+    return Prediction(bare, log.time[run], log.true_position[run], sent, sent / duration_s, begun, log.velocities)
 
 
 PASSES_ABOVE: Final = 1e3  # [m] more than the sum of two radii

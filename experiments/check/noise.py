@@ -10,7 +10,7 @@ import numpy as np
 
 from experiments.check.analysis import Analysis
 from experiments.check.findings import DELAYED, FORGIVEN, Finding
-from experiments.check.ideal_run import fly, has_noise, isolated, repetitions
+from experiments.check.ideal_run import fly, has_noise, repetitions
 from experiments.check.theory import strength
 from experiments.metrics.signals import WINDOW_S
 
@@ -36,7 +36,7 @@ class Flights:
 
     @classmethod
     def of(cls, analysis: Analysis) -> Flights:
-        bare = isolated(analysis.plan)
+        bare = analysis.prediction.bare
         count = repetitions(bare)
         first, beside = bare.experiment.seed, analysis.prediction.noisy
         flown = [] if beside is None else [beside]

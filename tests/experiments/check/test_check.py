@@ -255,9 +255,9 @@ def test_absurd_numbers_end_in_findings(change):
 
 def test_batteries_ending_before_the_run_are_all_named():
     def messages_after(duration_s: float, **safety: float) -> list[str]:
-        made = changed(reference(), duration_s=duration_s, safety=changed(reference().safety, **safety))
-        standing = Prediction(np.zeros(1), np.zeros((1, len(made.robots), 3)), 0, 0.0)
-        return [each.message for each in batteries(Analysis(Plan(made), standing)) if each.code == "battery-ends"]
+        plan = Plan(changed(reference(), duration_s=duration_s, safety=changed(reference().safety, **safety)))
+        standing = Prediction(plan, np.zeros(1), np.zeros((1, len(plan.names), 3)), 0, 0.0)
+        return [each.message for each in batteries(Analysis(plan, standing)) if each.code == "battery-ends"]
 
     wheels, drones = messages_after(12000.0)
     assert "TB01 stops after about 8095 s of 12000 s" in wheels  # a Khepera lasts five hours
@@ -269,7 +269,8 @@ def test_batteries_ending_before_the_run_are_all_named():
 def test_linked_robots_that_come_nearer_than_the_separation():
     robots = {name: RobotTable(kind="khepera4", start=[x, 0.0]) for name, x in (("A", -0.5), ("B", 0.5))}
     plan = Plan(small(robots, {"A - B": 1.0}, safety=Safety(separation=0.5)))
-    motion = Prediction(np.arange(2.0), np.array([[(-0.5, 0, 0), (0.5, 0, 0)], [(-0.2, 0, 0), (0.2, 0, 0)]]), 2, 1.0)
+    places = np.array([[(-0.5, 0, 0), (0.5, 0, 0)], [(-0.2, 0, 0), (0.2, 0, 0)]])
+    motion = Prediction(plan, np.arange(2.0), places, 2, 1.0)
     (found,) = safety(Analysis(plan, motion))
     assert (found.code, "come within 0.40 m" in found.message) == ("separation-path", True)
 

@@ -209,8 +209,8 @@ def test_flights_are_judged(made, severity, code, message, remedy):
 
 
 def test_part_of_a_long_run_is_noted():
-    motion = Prediction(np.array([0.0, 5.0]), np.zeros((2, 4, 3)), 0, 0.0)
-    made = Analysis(Plan(small(GROUND, duration_s=600.0)), motion)
+    plan = Plan(small(GROUND, duration_s=600.0))
+    made = Analysis(plan, Prediction(plan, np.array([0.0, 5.0]), np.zeros((2, 4, 3)), 0, 0.0))
     assert [found.code for found in flight(made)] == ["predicted-in-part"]
 
 

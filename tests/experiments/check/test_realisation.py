@@ -176,8 +176,9 @@ def test_robots_on_the_wrong_side_are_named():
     robots = {f"K{k}": RobotTable(kind="khepera4", start=list(place[:2])) for k, place in enumerate(end.position)}
     given = {f"K{i} - K{j}": d for (i, j), d in zip(pairs, wanted.distance.tolist(), strict=True)}
     made = small(robots, formation=Formation(links=given, leader=None), duration_s=5.0)
-    motion = Prediction(np.array([0.0, 5.0]), np.stack([end.position] * 2), 10, 2.0)
-    (finding,) = formation(Analysis(Plan(made), motion))
+    plan = Plan(made)
+    motion = Prediction(plan, np.array([0.0, 5.0]), np.stack([end.position] * 2), 10, 2.0)
+    (finding,) = formation(Analysis(plan, motion))
     assert (finding.code, "K4 near (-0.14, 0.86) in the room" in finding.remedy) == ("local-minimum", True)
 
 
