@@ -14,6 +14,7 @@ from agents.decision.assignment import Assignment
 from agents.errors import ExplainedError, did_you_mean
 from agents.plugins.law import Control, Law, Memory, View
 from agents.plugins.triggers import Trigger, TriggerView
+from twins.arrays import Array
 
 Action = Literal["velocity", "goal"]
 
@@ -91,14 +92,18 @@ class AgentActions:
         for name in agents:
             if name not in actions:
                 raise LearningError(f"actions: there is none for {name}; give one for each of `env.agents`")
-            numbers = np.asarray(actions[name], dtype=float)
-            if numbers.shape != (len(self.numbers),):
+            if (shape := np.shape(actions[name])) != (len(self.numbers),):
                 wanted = f"give {len(self.numbers)} numbers: {', '.join(self.numbers)}"
-                raise LearningError(f"actions: that of {name} has the shape {numbers.shape}; {wanted}")
-            x, y, *said = numbers.tolist()
-            if not np.isfinite(numbers).all():
-                remedy = "look for NaN in its observation and in the weights of the policy"
-                raise LearningError(f"actions: that of {name} is {numbers.tolist()}, not finite; {remedy}")
+                raise LearningError(f"actions: that of {name} has the shape {shape}; {wanted}")
+        self.take_rows(np.array([actions[name] for name in agents], dtype=float), agents)
+
+    def take_rows(self, actions: Array, agents: Sequence[str]) -> None:
+        """The same of actions (N, A) in the order of `agents`."""
+        if not np.isfinite(actions).all():
+            row = int(np.argmin(np.isfinite(actions).all(axis=1)))
+            remedy = "look for NaN in its observation and in the weights of the policy"
+            raise LearningError(f"actions: that of {agents[row]} is {actions[row].tolist()}, not finite; {remedy}")
+        for name, (x, y, *said) in zip(agents, actions.tolist(), strict=True):
             row = self._rows[name]
             self._actions[2 * row], self._actions[2 * row + 1] = x, y
             if said and said[0] > 0.0:

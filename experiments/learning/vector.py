@@ -16,12 +16,13 @@ from gymnasium.vector.utils import batch_space
 from experiments.cores import cores
 from experiments.learning.actions import LearningError
 from experiments.learning.environment import Environment
-from twins.arrays import Array
+from experiments.learning.window import SEEN
+from twins.arrays import Array, Mask
 
 SEEDS: Final = 10_000  # seeds of one environment before those of the next one
 ENDED_S: Final = 5.0  # [s] longest wait for the end of a process
 
-Outcome = tuple[Array, Array, Array, Array, dict[int, Array]]  # results of `Batch.step`
+Outcome = tuple[Any, Array, Mask, Mask, dict[int, Any]]  # results of `Batch.step`
 
 
 class SingleAgent(gymnasium.Env[Any, Any]):
@@ -57,8 +58,9 @@ class Batch:
 
     def reset(self, seeds: Sequence[int | None]) -> Array:
         """Observations (E, N, K)."""
-        found = [each.reset(seed)[0] for each, seed in zip(self.every, seeds, strict=True)]
-        return np.array([[*each.values()] for each in found])
+        for each, seed in zip(self.every, seeds, strict=True):
+            each.reset(seed)
+        return np.array([each.observed for each in self.every])
 
     def step(self, actions: Array) -> Outcome:
         """Fly on by the actions (E, N, A); an environment of which a robot has ended begins again.
@@ -66,17 +68,19 @@ class Batch:
         Returns:
             Observations (E, N, K), rewards, ends and truncations (E, N), and the last observations of what has ended.
         """
-        parts, last = [], dict[int, Array]()
-        for number, (each, given) in enumerate(zip(self.every, actions, strict=True)):
-            names = each.possible_agents
-            found = each.step(dict(zip(names, given, strict=True)))
-            seen, rewards, ended, truncated = (np.array([part[name] for name in names]) for part in found[:4])
-            if len(each.agents) < len(names):
-                last[number], truncated = seen, ~ended
-                seen = np.array([*each.reset()[0].values()])
-            parts.append((seen, rewards, ended, truncated))
-        seen, rewards, ended, truncated = (np.array(part) for part in zip(*parts, strict=True))
-        return seen, rewards, ended, truncated, last
+        every, names = self.every, self.every[0].agents
+        for each, given in zip(every, actions, strict=True):
+            each.acts.take_rows(given, names)
+        found = every[0].rewards.decide([each.flight for each in every], [each.table for each in every], every[0].rows)
+        seen = found.shown[:, :, SEEN:].astype(np.float32)
+        if every[0].looks:
+            seen = np.array([each.observed for each in every])
+        done, last = found.over | found.ended.any(axis=1), dict[int, Array]()
+        for number in np.flatnonzero(done).tolist():
+            last[number] = seen[number].copy()
+            every[number].reset()
+            seen[number] = every[number].observed
+        return seen, found.rewards, found.ended, done[:, None] & ~found.ended, last
 
 
 class Environments(gymnasium.vector.VectorEnv[Any, Any, Any]):

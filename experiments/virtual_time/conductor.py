@@ -39,8 +39,10 @@ class VirtualConductor:
         For as long as no phase changes.
         """
         if self._stage == Phase.RUNNING:
-            ends = (self.start_at, self.start_at + self._robots[0].assignment.duration)
-            return next((last for last in (round(end / dt) for end in ends) if last > tick), tick)
+            for end in (self.start_at, self.start_at + self._robots[0].assignment.duration):
+                if (last := round(end / dt)) > tick:
+                    return last
+            return tick
         if min([robot.lifecycle.phase for robot in self._robots]) < self._stage:
             return max(tick, round((self._since + self._patience_s) / dt))
         every = max(1, round(ORDERS_S / dt))

@@ -135,7 +135,7 @@ class Layouts:
             return number
         if isinstance(value, int):  # member of an enumeration
             return INT
-        if isinstance(value, array):
+        if isinstance(value, array | memoryview):  # their items are floats
             return Items(FLOAT)
         if isinstance(value, list | tuple):
             return self._kind_of_items(value, where)
@@ -253,6 +253,7 @@ class Image:
         # objects that can change, by identity, each with its place [bytes]
         self.places: dict[int, tuple[Any, RecordLayout, int]] = {}
         self._lists: list[tuple[list[Any], Items, int]] = []
+        self.arrays: dict[int, array[float]] = {}  # arrays that records refer to, by identity
         self.used = 0
         try:
             for thing, layout in self.roots:
@@ -302,7 +303,10 @@ class Image:
         """Store a list unless it is there already; returns its address and its length."""
         count, item = len(items), kind.item
         if isinstance(items, array):
+            self.arrays[id(items)] = items
             return items.buffer_info()[0], count
+        if isinstance(items, memoryview):
+            return np.frombuffer(items).ctypes.data, count
         found = self.known.get(id(items))
         if found is None:
             at = self.take(items, count * kind.words)

@@ -31,7 +31,7 @@ from experiments.virtual_time.conductor import PATIENCE_S, Stuck, VirtualConduct
 from experiments.virtual_time.network import CentreLog, VirtualNetwork
 from experiments.virtual_time.steps import Steps
 from experiments.virtual_time.stretch import Stretches, TornError, stretches_of
-from experiments.virtual_time.tick import LEAN, PLACES, WIDTH, Ledger
+from experiments.virtual_time.tick import LEAN, PLACES, WIDTH, Display, Ledger
 from twins.arrays import Array, Index
 from twins.body import TwinBody
 from twins.engines.engine import Engine, Touch
@@ -139,12 +139,15 @@ class VirtualRun:
         lean: bool = False,
         patience_s: float = PATIENCE_S,
         assignments: Mapping[str, Assignment] | None = None,
+        window: Display | None = None,
     ) -> None:
         """Set up a run; for the arguments see `simulate`.
 
         Args:
             assignments: By the names of robots, of those with a law or a trigger other than the file's.
+            window: Display of a learner, for `fly_ticks`.
         """
+        self.window = window
         self._begin = partial(self._set_up, plan, seed, assignments or {}, quiet=quiet, patience_s=patience_s)
         self.lean = lean
         self._begin()
@@ -255,16 +258,39 @@ class VirtualRun:
         self._give_orders()
         self._tick += 1
 
-    def fly_ticks(self, count: int, *, everything: bool = True) -> None:
-        """Fly `count` ticks from between the halves of this one, compiled where that pays.
+    def fly_ticks(self, count: int) -> None:
+        """Fly `count` ticks from between the halves of this one, compiled where that pays; then fill the window.
 
-        `everything`: all of the robots may be read then; else their states, phases and views alone.
+        For anything else of the robots call `read`.
         """
         end = self._tick + count
         while self._tick < end:
             if not self._fly_stretch(end):
                 self.decide(self.time)
                 self.observe(self.time)
+        self.show()
+
+    def rewind(self, t: float) -> bool:
+        """Go back to `t` [s], if compiled ticks flew all since; returns whether that was possible."""
+        k = round(t / self.dt)
+        if self.stretches is None or not self.stretches.rewind(k):
+            return False
+        self._tick = k
+        return True
+
+    def show(self) -> None:
+        """Fill the window, unless compiled ticks did."""
+        window = self.window
+        if window is not None and not window.is_of(self.time):
+            self.read(everything=False)
+            for row, robot in enumerate(self.robots):
+                window.place(robot, row, self.network.seq[row])
+            for row, robot in enumerate(self.robots):
+                window.show(robot, row, self.time)
+                self._keep(robot)
+
+    def read(self, *, everything: bool = True) -> None:
+        """Read the robots as they are, if compiled ticks fly them; not `everything`: states, phases and views alone."""
         if self.stretches is not None and self.stretches.open:
             self.stretches.read(None if everything else self._seen())
 
@@ -276,16 +302,20 @@ class VirtualRun:
 
     def view(self, row: int) -> View:
         """View of a robot, as its law would get it now; once in a tick."""
-        robot, goals = self.robots[row], self.robots[row].goals
-        view = robot.view(self.time)
+        view = self.robots[row].view(self.time)
+        self._keep(self.robots[row])
+        return view
+
+    def _keep(self, robot: Robot) -> None:
+        """Let compiled ticks know what a view changed."""
+        goals = robot.goals
         if self.stretches is not None and (goals.changes_shape or goals.itinerary is not None):
             self.stretches.write([goals, *goals.rare_parts()])
-        return view
 
     def __getstate__(self) -> dict[str, Any]:
         if self.stretches is not None and self.stretches.open:
             self.stretches.leave()
-        return self.__dict__ | {"stretches": None}
+        return self.__dict__ | {"stretches": None, "window": None}
 
     def snapshot(self, t: float) -> Snapshot:
         """State of the run at `t` [s]."""

@@ -16,7 +16,7 @@ from agents.decision.goals import GoalComputer
 from agents.decision.stepping import Words
 from agents.plugins.law import is_known
 from experiments.virtual_time.records import MEASURES, Image
-from experiments.virtual_time.tick import Ledger, Member, Stage
+from experiments.virtual_time.tick import Display, Ledger, Member, Stage
 from twins.arrays import Array
 from twins.body import TwinBody
 from twins.engines.engine import Touch
@@ -35,9 +35,10 @@ class Rare(NamedTuple):
 class Steps:
     """Calls back of all robots in stretches."""
 
-    def __init__(self, members: Sequence[Member], twin: TwinBody, touches: list[Touch]) -> None:
+    def __init__(self, members: Sequence[Member], twin: TwinBody, touches: list[Touch], window: Display | None) -> None:
         """`touches`: contacts of the run, to which those in stretches are added."""
         self._members, self._twin, self._touches = members, twin, touches
+        self.window = window
         self.stage = Stage(len(members)) if twin.together else None
         self.obstacles: dict[float, list[tuple[float, ...]]] = {}  # poses of a world's obstacles at each time [s]
         self._laws = [(each.row, law) for each in members if (law := each.robot.stepping) is not None]
@@ -62,6 +63,8 @@ class Steps:
         if self.stage is not None:
             motions = self._twin.engine.motions
             yield self.stage, Rare(self._advance, motions, motions)
+        if self.window is not None:
+            yield self.window, Rare(lambda *_: None, (), ())  # a run fills it itself then
 
     def _call(self, address: int, which: int, given: Any) -> int:  # noqa: ANN401 - an array of C
         """A rare function of an object; returns 1 after an error."""

@@ -11,12 +11,12 @@ import sys
 from array import array
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Protocol
+from typing import Any, Final, Protocol, cast
 
 import msgspec
 import numpy as np
 
-from agents.decision.lifecycle import AIRBORNE
+from agents.decision.lifecycle import AIRBORNE, RUNNING
 from agents.plugins.planners import Itinerary
 from agents.robot import Robot
 from agents.vectors import UNKNOWN
@@ -25,9 +25,10 @@ from experiments.virtual_time import machine, tick
 from experiments.virtual_time.network import Arrived, VirtualNetwork
 from experiments.virtual_time.records import Image, Layouts, RecordLayout
 from experiments.virtual_time.steps import Steps
-from experiments.virtual_time.tick import Crew, Ledger, LinkQueue, Member, PlannedTargets
+from experiments.virtual_time.tick import Crew, Display, Ledger, LinkQueue, Member, PlannedTargets
 from experiments.virtual_time.translator.kinds import BOOLEAN, DOUBLE, WHOLE, OutsideError
 from experiments.virtual_time.translator.translation import Program
+from twins.arrays import Index
 from twins.body import TwinBody
 from twins.engines.engine import Touch
 
@@ -76,12 +77,16 @@ def stretch(crew, k, end, leg, dt, log_every, instant):
         if trouble:
             ledger.ended = True
             return k
+    if crew.window is not None:
+        {place}
+        {show}
     return k
 """
 PARTS: Final = {  # parts of the driver, of each group of robots
     "advance": "advance({}, t, dt)", "begin_step": "begin_step({})", "end_step": "end_step({}, t, dt)",
     "deliver": "deliver({}, t)", "observe": "moves = observe({}, t) or moves", "transmit": "transmit({}, t, ledger)",
     "detect": "trouble = detect({}, t) or trouble", "pursue": "pursue({}, t)", "note": "note({}, ledger)",
+    "place": "place({}, crew.window)", "show": "show({}, crew.window, t)",
 }  # fmt: skip
 TYPES: Final[dict[str, Any]] = {WHOLE: ctypes.c_int64, DOUBLE: ctypes.c_double, BOOLEAN: ctypes.c_bool}
 GIVEN: Final = (WHOLE, WHOLE, WHOLE, DOUBLE, WHOLE, BOOLEAN)  # arguments of the driver behind the crew
@@ -104,6 +109,7 @@ class Flown(Protocol):
     lean: bool  # True for samples of true positions alone
     compiles: bool  # bodies and network need nothing outside of the subset but the engine of a world
     touches: list[Touch]
+    window: Display | None  # window of a learner
 
     @property
     def start_at(self) -> float:
@@ -172,6 +178,13 @@ class Prepared:
     layout: RecordLayout  # layout of the crew
     driver: CompiledLoop
     words: int = 1 << 12  # words that all objects have taken, at most, so far
+    flown_s: float = 0.0  # seconds of plain Python that its flights of this process would have taken, about
+
+    def count(self, seconds: float) -> None:
+        """Count work in seconds of plain Python; as much as was done probably follows, and `cc` pays for much."""
+        self.flown_s += seconds
+        if self.flown_s > OFTEN_S and not self.driver.refusal:
+            self.driver.compile(often=True)
 
 
 class Stretches:
@@ -186,7 +199,8 @@ class Stretches:
 
     def __init__(self, flight: Flown, *, to_start: bool = False) -> None:
         """`to_start`: no stretch goes on beyond the common start."""
-        self._flight, self._case = flight, msgspec.json.encode(flight.plan.experiment)
+        self._flight = flight
+        self._case = msgspec.json.encode(flight.plan.experiment) + str(flight.window is not None).encode()
         self._to_start = to_start
         twins = flight.twin.twins
         network, rates = flight.network, flight.plan.experiment.rates
@@ -195,19 +209,25 @@ class Stretches:
             Member(row, robot, twin, sum(says.values()))
             for row, (robot, twin) in enumerate(zip(flight.robots, twins, strict=True))
         ]
-        self._steps, self._ways = Steps(self._members, flight.twin, flight.touches), list[LinkQueue]()
+        self._steps, self._ways = Steps(self._members, flight.twin, flight.touches, flight.window), list[LinkQueue]()
         for (robot, k), channel in zip(network.receivers, network.channels, strict=True):
             sender = robot.neighbours.all[k]
             late = min(LATE * channel.jitter, LATEST_S)
             way = LinkQueue(sender, channel, ROOM + round((channel.delay + late) * rates.pose_hz), sum(says.values()))
             self._members[sender.sender].ways.append(way)
             self._ways.append(way)
+        self._under_way = array("d", bytes(8 * sum(len(way.samples) for way in self._ways)))
+        place, whole = 0, cast("memoryview[float]", memoryview(self._under_way))
+        for way in self._ways:  # one array of all of them is copied at once
+            way.samples, place = whole[place : place + len(way.samples)], place + len(way.samples)
         self._plans, self._itineraries = dict[int, PlannedTargets](), dict[int, Itinerary]()
         self.flown, self.refusal = 0, ""
         self._prepared: Prepared | None = None
         self._paused_until, self._refused = 0, False
         self._image: Image | None = None
         self._before: Sequence[Arrived] = ()
+        # words of the records at the begin of a stretch, and arrays, each with its numbers then
+        self._first: tuple[Index, list[tuple[array[float], array[float]]]] | None = None
 
     @property
     def open(self) -> bool:
@@ -217,7 +237,7 @@ class Stretches:
     def begin(self, k: int) -> bool:
         """Begin a stretch from tick `k`, of which the first half is done; returns whether it pays."""
         flight = self._flight
-        rates, duration_s = flight.plan.experiment.rates, flight.plan.experiment.duration_s
+        rates, duration_s = flight.plan.experiment.rates, flight.robots[0].assignment.duration
         longest = max(min(LONGEST, ROBOT_TICKS // len(flight.robots)), LEAST)
         soon = k * flight.dt + AHEAD_S
         ends = (soon if np.isnan(flight.start_at) else flight.start_at) + duration_s
@@ -250,6 +270,7 @@ class Stretches:
         if prepared is None or self._image is None:
             prepared = self._new(ledger)
             self._image = self._stored(prepared, ledger)
+        prepared.count(TICK_S * ticks * len(flight.robots))
         self._prepared, self.refusal = prepared, prepared.driver.refusal or self.refusal
         self.called_back = next(iter(prepared.driver.program.called_back.values()), "")
         if self.refusal:
@@ -259,6 +280,23 @@ class Stretches:
             self.leave()
             return False
         self._steps.board(self._image, k * flight.dt)
+        self._first = None
+        if flight.window is not None and not self._itineraries and not self.called_back:
+            notes = {id(each) for each in (ledger.times, ledger.sent, ledger.samples, ledger.laws)}
+            arrays = [(each, each[:]) for key, each in self._image.arrays.items() if key not in notes]
+            arrays.append((self._under_way, self._under_way[:]))
+            self._first = self._image.words.copy(), arrays
+        return True
+
+    def rewind(self, k: int) -> bool:
+        """Go back to tick `k`, if the present stretch began then, and all since was quiet; returns whether."""
+        prepared = self._prepared
+        if prepared is None or self._image is None or self._first is None or self._begun != k:
+            return False
+        prepared.count(TICK_S * (self.tick - self._begun) * len(self._members))
+        self._image.words[:], self.tick = self._first[0], self._begun
+        for each, begin in self._first[1]:
+            each[:] = begin
         return True
 
     def go(self, end: int) -> bool:
@@ -271,7 +309,7 @@ class Stretches:
         assert prepared is not None
         self.moved = False
         if steps.stage is None:
-            words, samples = image.words.copy(), [array("d", way.samples) for way in self._ways]
+            words, samples = image.words.copy(), self._under_way[:]
         given = (self.tick, end, self._leg, flight.dt, flight.log_every, flight.network.instant, steps.address)
         found = prepared.driver.run(image.address(image.roots[0][0]), *given)
         if found >= 0:
@@ -281,8 +319,7 @@ class Stretches:
             return self.moved or not (self._ledger.ended or self._ledger.moves)
         if steps.stage is None:
             image.words[:] = words
-            for way, before in zip(self._ways, samples, strict=True):
-                way.samples[:] = before
+            self._under_way[:] = samples
         if isinstance(steps.error, KeyboardInterrupt):
             raise steps.error
         if steps.stage is not None:
@@ -293,6 +330,7 @@ class Stretches:
     def _live(self, image: Image, t: float) -> bool:
         """Phases and plans move on at `t` [s]; returns False where it is more than a take-off or the common start."""
         robots, twins = self._flight.robots, self._flight.twin.twins
+        self._first = None
         image.read(part for each in robots for part in (each.lifecycle, each.now, each.now.state, each.landing))
         moving = [row for row, robot in enumerate(robots) if not robot.is_steady(t)]
         for life, lands_at in ((robots[row].lifecycle, robots[row].assignment.lands_at) for row in moving):
@@ -333,6 +371,7 @@ class Stretches:
 
     def write(self, things: Sequence[object]) -> None:
         """Let changes of these objects take effect."""
+        self._first = None
         if self._image is not None:
             self._image.write(things)
 
@@ -355,7 +394,7 @@ class Stretches:
     def _stored(self, prepared: Prepared, ledger: Ledger) -> Image | None:
         """All objects in memory, None if they are not of these layouts."""
         self._steps.measures = prepared.driver.program.measures
-        crew = Crew([[self._members[row] for row in rows] for rows in prepared.rows], ledger, self._steps.stage)
+        crew = self._crew(prepared.rows, ledger)
         try:
             image = Image([(crew, prepared.layout)], prepared.words, self._steps.measures)
         except TypeError as error:
@@ -374,7 +413,7 @@ class Stretches:
         for member in self._members:
             groups.setdefault(layouts.of(member), []).append(member.row)
         rows = [*groups.values()]
-        layout = layouts.of(Crew([[self._members[row] for row in each] for each in rows], ledger, self._steps.stage))
+        layout = layouts.of(self._crew(rows, ledger))
         assert layout is not None
         while len(RECENT) >= MAX_RECENT:
             del RECENT[next(iter(RECENT))]
@@ -382,6 +421,11 @@ class Stretches:
         often = max(WORK[1], plain_s(plan)) > OFTEN_S
         RECENT[self._case] = found = Prepared(rows, layout, driver(layout, len(rows), plan.names, often=often))
         return found
+
+    def _crew(self, rows: Sequence[Sequence[int]], ledger: Ledger) -> Crew:
+        """Crew of robots in groups of the same layout, by their `rows`."""
+        groups = [[self._members[row] for row in each] for each in rows]
+        return Crew(groups, ledger, self._steps.stage, self._flight.window)
 
     def _plan(self, k: int) -> None:
         """Targets of the decisions from tick `k` on, until the next leg of a plan: robots begin it where they are."""
@@ -404,7 +448,8 @@ class Stretches:
 
 def _goes_on(robot: Robot, t: float) -> bool:
     """Whether nothing happens to a robot, and its phase probably does not move on at `t` [s]: by its last state."""
-    if robot.lifecycle.moved or robot.takes_off or robot.lands or robot.stops:
+    life = robot.lifecycle
+    if (life.moved and life.phase != RUNNING) or robot.takes_off or robot.lands or robot.stops:
         return False
     return not (robot.causes or robot.hazards.under_way) and robot.is_steady(t)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from array import array
 from collections.abc import Sequence
 from math import inf, nan
-from typing import ClassVar, Final
+from typing import ClassVar, Final, Protocol
 
 from agents.decision.neighbours import Neighbour
 from agents.decision.stepping import Speech, Stepping
@@ -42,7 +42,7 @@ class LinkQueue:
     arrivals: array[float]  # time of arrival of each [s], infinity for those that are lost
     # samples on the link, in the order of their arrivals: arrival [s], number, stamp [s], position [m], velocity [m/s],
     # yaw [rad] and words of each
-    samples: array[float]
+    samples: array[float] | memoryview[float]
 
     def __init__(self, neighbour: Neighbour, channel: LinkChannel, size: int, words: int) -> None:
         """`words`: numbers beside a pose."""
@@ -50,7 +50,7 @@ class LinkQueue:
         self.first = self.next = self.sent = 0
         self.arrivals = array("d")
         self.wide = SENT + words
-        self.samples = array("d", (0.0,)) * (self.wide * size)
+        self.samples = array("d", bytes(8 * self.wide * size))
 
     def put(  # noqa: PLR0917 - quiet
         self, arrival: float, seq: int, stamp: float, position: Vector, velocity: Vector, yaw: float,
@@ -221,14 +221,34 @@ class Stage:
         raise TypeError(t)
 
 
+class Display(Protocol):
+    """Place where the robots are shown at the end of a stretch; see `experiments.learning.window`."""
+
+    def place(self, robot: Robot, row: int, sent: int) -> None:
+        """Note the place of a robot, of which `sent` is the number of its last transmission."""
+        ...
+
+    def show(self, robot: Robot, row: int, t: float) -> None:
+        """Show a robot at `t` [s], once the places of all are noted."""
+        ...
+
+    def is_of(self, t: float) -> bool:
+        """Whether all robots are shown as they are at `t` [s]; not quiet."""
+        ...
+
+
 class Crew:
     """Members, those of the same layout in lists g0, g1, ..., their world if they share one, and notes of a stretch."""
 
     ledger: Ledger
     stage: Stage | None
+    window: Display | None
 
-    def __init__(self, groups: Sequence[list[Member]], ledger: Ledger, stage: Stage | None) -> None:
+    def __init__(
+        self, groups: Sequence[list[Member]], ledger: Ledger, stage: Stage | None, window: Display | None
+    ) -> None:
         self.ledger, self.stage = ledger, stage
+        self.window = window
         for k, group in enumerate(groups):
             setattr(self, f"g{k}", group)
 
@@ -323,3 +343,15 @@ def note(members: list[Member], ledger: Ledger) -> None:
     """Note the states of these robots."""
     for member in members:
         ledger.note_state(member)
+
+
+def place(members: list[Member], window: Display) -> None:
+    """Note the places of these robots in a window."""
+    for member in members:
+        window.place(member.robot, member.row, member.seq)
+
+
+def show(members: list[Member], window: Display, t: float) -> None:
+    """Show these robots at `t` [s]."""
+    for member in members:
+        window.show(member.robot, member.row, t)

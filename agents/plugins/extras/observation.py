@@ -2,37 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, MutableSequence, Sequence
 from dataclasses import dataclass
 from math import cos, isfinite, pi, sin, tau
-from typing import Final
+from typing import ClassVar, Final
 
 from zenpark import NeighbourView, PluginError, View
 
-Numbers = tuple[float, ...]
-
 SCAN: Final = "scan"  # nearness of what the range sensors see; `scan:8` has 8 sectors
 MOST_SECTORS: Final = 360
-# parts of the robot itself: count of numbers, and where they come from
-OWN: Final[Mapping[str, tuple[int, Callable[[View], Numbers]]]] = {
-    "position": (2, lambda view: view.position[:2]),  # [m]
-    "velocity": (2, lambda view: view.velocity[:2]),  # [m/s]
-    "height": (1, lambda view: view.position[2:]),  # [m]
-    "yaw": (2, lambda view: (cos(view.yaw), sin(view.yaw)) if isfinite(view.yaw) else (0.0, 0.0)),
-    # place of its plan, seen from the robot [m]
-    "target": (2, lambda view: (view.target[0] - view.position[0], view.target[1] - view.position[1])),
-    "deviation": (1, lambda view: (view.deviation,)),  # error of what the neighbours believe [m]
-    "time": (1, lambda view: (view.time,)),  # time since the common start [s]
-}
-# parts of each neighbour
-EACH: Final[Mapping[str, tuple[int, Callable[[View, NeighbourView], Numbers]]]] = {
-    # where the robot believes it, seen from the robot [m]
-    "place": (2, lambda view, of: (of.position[0] - view.position[0], of.position[1] - view.position[1])),
-    "wanted": (2, lambda _, of: (-of.link.relative[0], -of.link.relative[1])),  # likewise, by the target of the link
-    "distance": (1, lambda _, of: (of.link.distance,)),  # wanted [m]
-    "moves": (2, lambda _, of: of.velocity[:2]),  # velocity in its last pose [m/s]
-    "age": (1, lambda _, of: (of.age,)),  # age of its last pose [s]
-}
+# parts of the robot itself, and parts of each neighbour, each with its count of numbers
+OWN: Final[Mapping[str, int]] = {
+    "position": 2, "velocity": 2, "height": 1, "yaw": 2, "target": 2, "deviation": 1, "time": 1,
+}  # fmt: skip
+EACH: Final[Mapping[str, int]] = {"place": 2, "wanted": 2, "distance": 1, "moves": 2, "age": 1}
 
 
 @dataclass(frozen=True)
@@ -42,6 +25,8 @@ class Observation:
     own: tuple[str, ...] = ("position", "velocity")
     each: tuple[str, ...] = ("place", "wanted")
     places: int = 0
+
+    FIXED: ClassVar = ("own", "each")
 
     def __post_init__(self) -> None:
         for parts, known in ((self.own, (*OWN, f"{SCAN}:8")), (self.each, (*EACH,))):
@@ -67,24 +52,67 @@ class Observation:
     @property
     def width(self) -> int:
         """Count of numbers of a neighbour."""
-        return sum(EACH[part][0] for part in self.each)
+        return sum(EACH[part] for part in self.each)
 
     @property
     def size(self) -> int:
         """Count of all numbers."""
-        return sum(_sectors(part) or OWN[part][0] for part in self.own) + self.width * self.places
+        return sum(_sectors(part) or OWN[part] for part in self.own) + self.width * self.places
 
     def of(self, view: View) -> list[float]:
         """Observation of the first neighbours; what is unknown, or not there, is 0."""
-        found: list[float] = []
+        found = [0.0] * self.size
+        self.write(view, found, 0)
+        return found
+
+    def write(self, view: View, numbers: MutableSequence[float], k: int) -> None:
+        """The same into `numbers`, all of them 0, from place `k` on; quiet without a scan."""
         for part in self.own:
-            sectors = _sectors(part)
-            found += nearness(view, sectors) if sectors else OWN[part][1](view)
-        for other in view.neighbours[: self.places]:
-            for part in self.each:
-                found += EACH[part][1](view, other)
-        found += [0.0] * (self.size - len(found))
-        return [each if isfinite(each) else 0.0 for each in found]
+            for value in of_robot(part, view):
+                numbers[k] = value if isfinite(value) else 0.0
+                k += 1
+        place = 0
+        for other in view.neighbours:
+            if place < self.places:
+                for part in self.each:
+                    for value in of_neighbour(part, view, other):
+                        numbers[k] = value if isfinite(value) else 0.0
+                        k += 1
+            place += 1  # noqa: SIM113 - quiet
+
+
+def of_robot(part: str, view: View) -> Sequence[float]:  # noqa: PLR0911 - one for each part
+    """Numbers of a part of the robot itself; quiet, except for scans."""
+    x, y, z = view.position
+    if part == "position":
+        return x, y  # [m]
+    if part == "velocity":
+        return view.velocity[0], view.velocity[1]  # [m/s]
+    if part == "height":
+        return (z,)  # [m]
+    if part == "yaw":
+        return (cos(view.yaw), sin(view.yaw)) if isfinite(view.yaw) else (0.0, 0.0)
+    if part == "target":
+        return view.target[0] - x, view.target[1] - y  # place of its plan, seen from the robot [m]
+    if part == "deviation":
+        return (view.deviation,)  # error of what the neighbours believe [m]
+    if part == "time":
+        return (view.time,)  # time since the common start [s]
+    return nearness(view, _sectors(part))
+
+
+def of_neighbour(part: str, view: View, other: NeighbourView) -> tuple[float, ...]:
+    """Numbers of a part of a neighbour; quiet."""
+    x, y, _ = other.position
+    if part == "place":
+        return x - view.position[0], y - view.position[1]  # its believed place, seen from the robot [m]
+    if part == "wanted":
+        return -other.link.relative[0], -other.link.relative[1]  # likewise, by the target of the link
+    if part == "distance":
+        return (other.link.distance,)  # wanted [m]
+    if part == "moves":
+        return other.velocity[0], other.velocity[1]  # velocity in its last pose [m/s]
+    return (other.age,)  # age of its last pose [s]
 
 
 def nearness(view: View, sectors: int) -> list[float]:

@@ -84,6 +84,9 @@ class Calls(Expressions):
         given, by_name = self.given(node, owner)
         if owner and isinstance(node.func, ast.Attribute):
             if isinstance(given[0].constant, Mapping) and node.func.attr == "get":
+                if isinstance(given[1].constant, str) and len(given) == 3:
+                    known, key = given[0].constant, given[1].constant
+                    return self.known(known[key], node) if key in known else given[2]
                 if len(given) != 3 or given[2].type == NONE:
                     raise self.error(node, "`get` without a default")
                 return self.entry(given[0], given[1], given[2], node)
@@ -168,7 +171,8 @@ class Calls(Expressions):
     def call_back(self, thing: Value, which: int, given: Sequence[Value], node: ast.AST) -> Value:
         """Call of a rare function of an object, in Python, with numbers: objects are there; it returns nothing."""
         values = [each for each in given if not isinstance(each.type, RecordLayout)]
-        parts = [part for each in values for part in (self.parts(each, node) if each.type != DOUBLE else [each])]
+        several = [self.parts(each, node) if isinstance(each.type, Several) else [each] for each in values]
+        parts = [part for each in several for part in each]
         numbers, name = ", ".join(self.of_type(each, DOUBLE, node).text for each in parts), self.new()
         self.emit(
             f"double {name}[] = {{{numbers or '0.0'}}};",

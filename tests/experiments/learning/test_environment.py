@@ -46,7 +46,7 @@ def fly(made, seed, act):
     while made.agents:
         _, rewards, *_ = made.step({name: act(name, made.view(name)) for name in made.agents})
         total += sum(rewards.values())
-        places.append([state.true_position for state in made._run.snapshot(0.0).states])
+        places.append([state.true_position for state in made.flight.snapshot(0.0).states])
     return np.array(places), total
 
 
@@ -139,7 +139,7 @@ def episodes(made, *, compiled, count=45):
                 state = made.save()
             if seed == 4 and k == 35:
                 made.reset(options={"state": state})
-        flown = made._run.stretches
+        flown = made.flight.stretches
         assert compiled or flown is None
         ticks += 0 if flown is None else flown.flown + flown.open * (flown.tick - flown._begun)
     stretch.WORK[:] = 0.0, 0.0
@@ -289,3 +289,41 @@ def test_vectors_are_their_environments(processes):
             vector.step(np.full((12, 2), math.nan))
     finally:
         vector.close()
+
+
+@pytest.mark.slow
+def test_compiled_flights_begin_again_in_their_records(monkeypatch):
+    monkeypatch.setattr(stretch, "OFTEN_S", 0.13)  # the machine's compiler takes over on the way
+    made = Environment(document.read("policy"), "event-loss", starts=1, observes="time velocity", observes_each="age")
+    shown, flights = [], set()
+    for turn in range(8):
+        stretch.WORK[:] = 1e6 if turn else -1e6, 0.0
+        observations, _ = made.reset(seed=3)
+        steps = [observations.values()]
+        for k in range(30):
+            found = made.step({name: (0.3 * math.sin(k), 0.1) for name in made.agents})
+            steps += [each.values() for each in found[:2]]
+        shown.append([[np.array(each).tolist() for each in step] for step in steps])
+        flights.add(id(made.flight))
+    assert all(each == shown[0] for each in shown)
+    assert len(flights) < 8
+    assert made.flight.stretches._prepared.driver.often
+    stretch.WORK[:] = 0.0, 0.0
+
+
+@pytest.mark.slow
+def test_vectors_are_compiled_environments():
+    def turns():
+        vector = Environments(Environment(load("policy", duration_s=1.0), "event", starts=2), 3, processes=1)
+        seen, _ = vector.reset(seed=5)
+        results, rng = [seen], np.random.default_rng(2)
+        for _ in range(35):
+            results += vector.step(rng.uniform(-0.3, 0.3, (12, 2)))[:4]
+        return results
+
+    both = []
+    for work in (-1e6, 1e6):
+        stretch.WORK[:] = work, 0.0
+        both.append(turns())
+    stretch.WORK[:] = 0.0, 0.0
+    assert all(np.array_equal(*pair) for pair in zip(*both, strict=True))
