@@ -89,12 +89,19 @@ class Perception:
 
     def notice(self, scan: RangeScan | None) -> None:
         """Take the newest range readings; rare. Raises ValueError if some of their rays lack a number."""
-        if scan is self.scan:
+        before = self.scan
+        if scan is before:
             return
         self.scan = scan
         self._unread = self.sees = True
+        count = self._ray_count
         self._scanned, self._ray_count = -inf, 0
         if scan is None:
+            return
+        same = before is not None and scan.bearing is before.bearing and scan.elevation is before.elevation
+        if count and same and type(scan.bearing) is type(scan.elevation) is tuple:  # constant directions
+            self._rays[2 : NUMBERS * count : NUMBERS] = array("d", scan.distance)
+            self._scanned, self._ray_count = scan.time, count
             return
         rays = array("d", chain.from_iterable(zip(scan.bearing, scan.elevation, scan.distance, strict=True)))
         self._scanned, self._ray_count = scan.time, len(rays) // NUMBERS

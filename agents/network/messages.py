@@ -483,8 +483,8 @@ def payloads(state: State, encoding: Encoding) -> Iterator[bytes]:
         yield from payloads(msgspec.structs.replace(state, received=part[0], goal_receipts=part[1]), encoding)
 
 
-def encode(message: Message, encoding: Encoding = "json") -> bytes:
-    """The payload of a message."""
+def encode(message: Message | PoseReceipt, encoding: Encoding = "json") -> bytes:
+    """The payload of a message, or a part of one."""
     return _json.encode(message) if encoding == "json" else _msgpack.encode(message)
 
 

@@ -11,6 +11,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
+import msgspec
 import numpy as np
 from msgspec.structs import replace
 
@@ -229,14 +230,22 @@ class RunRecorder:
                 ],
             )
 
-    def _received_by_sample(self) -> Iterator[dict[int, list[messages.PoseReceipt]]]:
+    def _received_by_sample(self) -> Iterator[dict[int, list[Any]]]:
+        """Receipts as they are encoded: several robots receive the same pose at the same time."""
         names, got = self._log.names, self._log.received
-        columns = (self._links.sender[got.link], got.seq, got.stamp, got.arrival, got.position, got.velocity)
+        columns = (self._links.sender[got.link], got.seq, got.arrival, np.arange(len(got)))
+        known = dict[tuple[int, int, float], msgspec.Raw]()
 
-        def receipt(values: list[Any]) -> messages.PoseReceipt:
-            sender, seq, taken, arrived, position, velocity = values
-            stamps = EPOCH + taken, EPOCH + arrived
-            return messages.PoseReceipt(names[sender], seq, *stamps, tuple(position), tuple(velocity))
+        def receipt(values: list[Any]) -> msgspec.Raw:
+            sender, seq, arrived, k = values
+            if (found := known.get((sender, seq, arrived))) is None:
+                if len(known) > MANY_ROWS:
+                    known.clear()
+                stamps = EPOCH + float(got.stamp[k]), EPOCH + arrived
+                moves = tuple(got.position[k].tolist()), tuple(got.velocity[k].tolist())
+                payload = messages.encode(messages.PoseReceipt(names[sender], seq, *stamps, *moves), self._encoding)
+                known[sender, seq, arrived] = found = msgspec.Raw(payload)
+            return found
 
         return self._by_sample(got.arrival, self._links.receiver[got.link], columns, receipt)
 

@@ -104,11 +104,11 @@ class RangeSensors:
         return True
 
 
-def _directions(names: Sequence[str]) -> tuple[list[float], list[float]]:
+def _directions(names: Sequence[str]) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Bearings and elevations of the rays of some sensors [rad]."""
     fans = [fan(sensors()[name]) for name in names]
-    bearing = [ray for each in fans for ray in each.bearing.tolist()]
-    return bearing, [ray for each in fans for ray in each.elevation.tolist()]
+    bearing = tuple(ray for each in fans for ray in each.bearing.tolist())
+    return bearing, tuple(ray for each in fans for ray in each.elevation.tolist())
 
 
 def _arrange_beams(mounted: Sequence[_Mounted]) -> Beams:
