@@ -46,10 +46,10 @@ class Preflight:
         self._assignment, self._limits = assignment, assignment.limits
         self._since, self._covered = inf, False  # covered: a drone with a robot above it
         x, y = assignment.start or (0.0, 0.0)
-        self._other_starts = [
-            each for each in assignment.starts if hypot(each[1] - x, each[2] - y) > assignment.kind.radius + each[3]
-        ]
-        self._nearest_start = min((hypot(each[1] - x, each[2] - y) for each in self._other_starts), default=inf)
+        starts = [(hypot(each[1] - x, each[2] - y), each) for each in assignment.starts]
+        starts = [(away, each) for away, each in starts if away > assignment.kind.radius + each[3]]
+        self._other_starts = [each for _, each in starts]
+        self._nearest_start = min((away for away, _ in starts), default=inf)
         self._flies, self._placed = assignment.kind.flies, assignment.start is not None
         self._start, self._yaw = (x, y), assignment.start_yaw
         self._near = SURE * min(assignment.start_within, 0.5 * self._nearest_start)

@@ -100,6 +100,13 @@ def attributes(owner: type) -> tuple[str, ...]:
     return tuple(name for name in dict.fromkeys(names) if name not in LEFT_OUT)
 
 
+@cache
+def marks(owner: type) -> tuple[tuple[str, ...], set[str], list[set[str]]]:
+    """Attributes of objects with slots, those of no use, and those that a class names; see above."""
+    names = [set(getattr(owner, each, ())) for each in ("FIXED", "NAMED", "MEASURED", "UNSIGNED")]
+    return attributes(owner), LEFT_OUT | set(getattr(owner, "RARE", ())), names
+
+
 def is_frozen(owner: type) -> bool:
     """Whether objects of a class never change."""
     struct, data = getattr(owner, "__struct_config__", None), getattr(owner, "__dataclass_params__", None)
@@ -173,9 +180,10 @@ class Layouts:
         self._of[id(thing)] = (thing, None)
         owner: type = type(thing)
         fields, fixed = dict[str, Any](), dict[str, Any]()
-        names, rare = getattr(owner, "FIXED", ()), LEFT_OUT | set(getattr(owner, "RARE", ()))
-        named, measured = getattr(owner, "NAMED", ()), getattr(owner, "MEASURED", ())
-        for name in [each for each in (*attributes(owner), *getattr(thing, "__dict__", ())) if each not in rare]:
+        listed, rare, (names, named, measured, unsigned) = marks(owner)
+        for name in (*listed, *getattr(thing, "__dict__", ())):
+            if name in rare:
+                continue
             try:
                 value = getattr(thing, name)
             except AttributeError:  # never set
@@ -185,7 +193,7 @@ class Layouts:
                 kind = Named(tuple(sorted(value)), tuple(len(value[each]) for each in sorted(value)))
             elif name in measured:
                 kind = Measured()
-            elif name in getattr(owner, "UNSIGNED", ()):
+            elif name in unsigned:
                 kind = UNSIGNED
             elif name not in names and value is not None:
                 kind = NUMBERS.get(type(value)) or self.kind(value, (owner, name))
