@@ -122,22 +122,21 @@ def code_of(plan: Plan) -> str:
 @cache
 def digest_of_code(root: Path = ROOT) -> str:
     """Digest of our modules that determine results, without their comments; none of reports, scenes and recordings."""
-    total, seen = hashlib.sha256(), set[Path]()
-    left = [root / WORK, *(file for pattern in PLUG_INS for file in root.glob(pattern))]
+    total, seen = hashlib.sha256(), set[str]()  # names, since paths are slow
+    left = [WORK, *(file.relative_to(root).as_posix() for pattern in PLUG_INS for file in root.glob(pattern))]
     texts = dict[str, str]()
     while left:
-        file = left.pop()
-        if file in seen or root not in file.parents or not file.is_file():
+        name = left.pop()
+        if name in seen or name.startswith(DRAWING):
             continue
-        name = file.relative_to(root).as_posix()
-        if name.startswith(DRAWING):
+        seen.add(name)
+        if not (file := root / name).is_file():
             continue
-        seen.add(file)
         texts[name] = text = without_comments(file.read_text("utf-8"))
         for package, names in _IMPORT.findall(text):
-            for module in (package, *(f"{package}.{each}".strip(".") for each in re.findall(r"[\w.]+", names))):
-                place = root / module.replace(".", "/")
-                left += [place.with_suffix(".py"), place / "__init__.py"]
+            modules = (package, *(f"{package}.{each}".strip(".") for each in re.findall(r"[\w.]+", names)))
+            for place in (module.replace(".", "/") for module in modules if module):
+                left += [f"{place}.py", f"{place}/__init__.py"]
     for name, text in sorted(texts.items()):
         total.update(f"{name}\0{len(text)}\0{text}".encode())
     return total.hexdigest()
