@@ -4,7 +4,8 @@ A command prints them without a traceback and ends with exit code 2.
 """
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 
 
 class ExplainedError(Exception):
@@ -13,6 +14,15 @@ class ExplainedError(Exception):
 
 class Refusal(Exception):
     """An order that is not carried out, with reason and remedy."""
+
+
+@contextmanager
+def writing(place: object, remedy: str) -> Iterator[None]:
+    """Raises ExplainedError if a file or folder cannot be written inside."""
+    try:
+        yield
+    except OSError as error:
+        raise ExplainedError(f"{place}: cannot be written: {error.strerror}; {remedy}") from None
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

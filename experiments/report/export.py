@@ -8,8 +8,7 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Container, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Container, Iterable, Mapping
 from importlib import import_module
 from pathlib import Path
 from subprocess import CalledProcessError
@@ -17,7 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from agents.errors import ExplainedError
+from agents.errors import ExplainedError, writing
 from experiments.definition.graph import adjacency
 from experiments.metrics.metric import FIGURES, PLAIN, known_metrics
 from experiments.metrics.results import CaseMetrics, RobotMetrics
@@ -75,7 +74,7 @@ def write_mat(
     for name, case in cases.items():
         if (size := _bytes(case)) >= most_bytes:
             raise ExplainedError(f"{file}: {name} has {size / 1e9:.1f} GB, MATLAB reads 2.1; export a table: --csv")
-    with _writing(file), file.open("wb") as stream:
+    with writing(file, "name another place"), file.open("wb") as stream:
         savemat(stream, cases, long_field_names=True, do_compression=True, oned_as="column")
 
 
@@ -86,7 +85,7 @@ def write_csv(traces: Mapping[str, Trace], file: Path) -> None:
     """
     columns = {case: trace.columns() for case, trace in traces.items()}
     of_law = dict.fromkeys(name for found in columns.values() for name in found if name not in COLUMNS)
-    with _writing(file), file.open("w", newline="", encoding="utf-8") as stream:
+    with writing(file, "name another place"), file.open("w", newline="", encoding="utf-8") as stream:
         table = csv.writer(stream)
         table.writerow(["case", "time", "robot", *COLUMNS, *of_law])
         for case, trace in traces.items():
@@ -121,7 +120,7 @@ def write_video(traces: Mapping[str, Trace], file: Path, speed: float = 4.0) -> 
         raise ExplainedError(f"{file}: no position is known in this run; there is nothing to show")
     figure, show = trajectories.film(shown)
     try:
-        with _writing(file), rc_context(dict(style.STYLE)):
+        with writing(file, "name another place"), rc_context(dict(style.STYLE)):
             writer = FFMpegWriter(FRAMES_HZ, bitrate=2000) if mp4 else PillowWriter(FRAMES_HZ)  # type: ignore[arg-type]
             with writer.saving(figure, str(file), 150 if mp4 else 110):
                 for t in np.arange(0.0, max(float(trace.time[-1]) for trace in shown), speed / FRAMES_HZ):
@@ -206,15 +205,6 @@ def matlab_names(names: Iterable[str], keywords: Container[str] = KEYWORDS) -> d
             short, number = f"{plain[: LONGEST - len(str(number)) - 1]}_{number}", number + 1
         found[name] = short
     return found
-
-
-@contextmanager
-def _writing(file: Path) -> Iterator[None]:
-    """Raises ExplainedError if `file` cannot be written inside."""
-    try:
-        yield
-    except OSError as error:
-        raise ExplainedError(f"{file}: cannot be written: {error.strerror}; name another place") from None
 
 
 def _bytes(value: Any) -> int:  # noqa: ANN401 - any field of a struct

@@ -8,7 +8,7 @@ from math import dist, inf, isfinite, isnan, nan
 import pytest
 
 from agents.body.interface import BodyState, RangeScan
-from agents.decision.lifecycle import AIRBORNE, DONE, IDLE, LANDING, RUNNING, Phase
+from agents.decision.lifecycle import AIRBORNE, DONE, IDLE, LANDING, RUNNING
 from agents.network.messages import Order
 from agents.plugins import registry
 from agents.plugins.laws import Distance
@@ -85,20 +85,6 @@ def test_blind_drone_lands(what, moment):
     assert swarm.until(DONE).last("F", "truth")[2] == 0.0
 
 
-@pytest.mark.parametrize("what", ["old", *LOST])
-def test_blind_wheels_stop_and_go_on(what):
-    swarm = Swarm(pair()).running().run(0.5)
-    swarm.spoil("A", frozen(swarm.t) if what == "old" else LOST[what])
-    if what == "old":
-        assert isfinite(swarm.run(0.4).robot("A").error)
-    swarm.run(1.0)
-    assert isnan(swarm.robot("A").error)
-    assert isfinite(swarm.robot("B").error)
-    assert (swarm.phase("A"), swarm.last("A", "setpoint")) == (RUNNING, STILL)
-    swarm.spoil("A", None)
-    assert any(swarm.run(0.3).last("A", "setpoint"))
-
-
 def test_followers_of_blind_wheels_stop():
     robots = {name: RobotTable(kind="khepera4", start=[x, 0.0]) for name, x in (("A", -1.5), ("B", -1.0))}
     shape = Formation(links={"B > A": 0.5})
@@ -135,17 +121,6 @@ def jump(swarm, name, lasts_s, off=1.0):
     swarm.spoil(name, lambda state: change(state) if swarm.t < begin + lasts_s else None)
 
 
-@pytest.mark.parametrize(("lasts_s", "lands"), [(0.01, False), (0.25, False), (0.5, True)])
-def test_drone_that_jumped_lands_unless_back(lasts_s, lands):
-    swarm = flying("running")
-    place = swarm.last("F", "truth")
-    jump(swarm, "F", lasts_s)
-    assert (swarm.run(2.0).phase("F") >= LANDING) == lands
-    text = swarm.robot("F").hazards.incidents[0].text
-    assert text.startswith("hold: its own position is lost: it jumped by 1.0")
-    assert dist(swarm.last("F", "truth")[:2], place[:2]) < 0.1
-
-
 @pytest.mark.parametrize("off", [4.0, 1e5])
 @pytest.mark.parametrize("begins", ["climbing", "running", "landing"])
 def test_refused_far_position_cuts_no_motors(begins, off):
@@ -172,48 +147,6 @@ def test_start_order_confirms_no_jump_in_the_air():
     assert isnan(robot.now.position[0])
 
 
-@pytest.mark.parametrize("moment", ["waiting", "running"])
-def test_robots_outside_the_arena_land_or_roll_out(moment):
-    swarm = flying(moment)
-    for x in (0.4, 0.8, 1.2, 1.6, 2.0, 2.2):  # no jump; the arena ends at 2 m
-        swarm.spoil("F", put((x, 0.0, 0.5)))
-        swarm.step()
-    assert swarm.run(0.1).phase("F") < LANDING
-    swarm.spoil("F", put((2.3, 0.0, 0.5)))
-    swarm.step()
-    assert ended(swarm, "F") == (LANDING, "it left the arena")
-    wheels = Swarm(pair()).running()
-    wheels.spoil("A", put((9.0, 0.0, 0.0)))
-    wheels.robot("A").resume()
-    assert ended(wheels.run(0.5), "A") == (DONE, "it left the arena")
-    assert wheels.phase("B") == RUNNING
-
-
-def test_stopped_motors_end_commands():
-    swarm = drone().running().run(0.2)
-    swarm.spoil("F", lambda state: setattr(state, "flying", False))
-    swarm.step()
-    assert ended(swarm, "F") == (LANDING, "it came down by itself")
-    swarm.step()  # the body is told to land, all the same
-    assert isnan(swarm.last("F", "setpoint")[0])
-    swarm.step()
-    assert swarm.phase("F") == DONE
-
-
-@pytest.mark.parametrize(("speed", "cause"), [(0.0, Cause.UNRESPONSIVE), (-0.15, Cause.STRAYING)])
-def test_dead_and_stubborn_wheels_are_found(speed, cause):
-    """Wheels that do not move, and wheels that drive on although they hold."""
-    swarm = Swarm(pair()).running()
-    if speed:
-        assert swarm.run(0.5).robot("A").hold() == ""
-    begin, (x, y, z) = swarm.t, swarm.last("A", "position")
-    swarm.spoil("A", lambda state: setattr(state, "position", (x + speed * (swarm.t - begin), y, z)))
-    swarm.run(4.0 if speed else 10.0)
-    assert cause in causes(swarm, "A")
-    assert swarm.phase("A") >= LANDING
-    assert swarm.last("A", "setpoint") == STILL
-
-
 class Mad(Distance, frozen=True):
     """Wants nothing that is a number of neighbours that are near."""
 
@@ -234,21 +167,6 @@ def test_law_that_wants_nonsense_is_stopped(kind, monkeypatch):
     near = Swarm(small({"A": "khepera4", "B": "khepera4"}, {"A - B": 0.5})).run(0.2)  # known before take-off
     assert ended(near, "A") == (IDLE, "its law wants something that is not finite")
     assert near.robot("A").lifecycle.takeoff()
-
-
-def test_robots_go_through_their_phases():
-    swarm = Swarm(small({"F": "crazyflie", "K": "khepera4"}, {"F - K": 0.8}, duration_s=1.0)).until(DONE)
-    for name, idle in (("F", isnan), ("K", (0.0).__eq__)):  # the body of a drone acts by itself
-        phases, setpoints = swarm.column(name, "phase"), swarm.column(name, "setpoint")
-        assert phases == sorted(phases)
-        for phase, setpoint in zip(phases, setpoints, strict=True):
-            assert all(map(isfinite if AIRBORNE <= phase <= RUNNING else idle, setpoint))
-        assert any(any(setpoint) for setpoint in setpoints if isfinite(setpoint[0]))
-    robot = swarm.robot("F")
-    assert set(swarm.column("F", "phase")) == set(map(int, Phase))
-    assert all((robot.lifecycle.takeoff(), robot.start(swarm.t), robot.hold())), "reasons"
-    assert swarm.run(1.0).last("F", "truth")[2] == 0.0
-    assert swarm.phase("F") == DONE
 
 
 def trouble(rng, swarm, name):

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 from typer import Argument, Option
 
-from agents.errors import ExplainedError
+from agents.errors import ExplainedError, writing
 from tools import completion
 from tools.options import AsJson, at_home, example, known_words, print_json, print_result, warn
 from tools.terminal import say
@@ -24,6 +23,8 @@ if TYPE_CHECKING:
     from experiments.run import Run
 
 app: Final = typer.Typer()
+
+ELSEWHERE: Final = "choose another place with --out"
 
 
 @app.command(epilog=example("report runs/first", "report runs/first runs/second --out comparison.html"))
@@ -101,7 +102,7 @@ def report(
     if several:
         return _compare(folders, named, Path(out or "comparison.html"), as_json=as_json)
     target = Path(out or (f"{Path(folders[0])}-pooled" if pooled else folders[0]))
-    with _writing(target):
+    with writing(target, ELSEWHERE):
         write_metrics(seeds, target)
         page = write_report(seeds, target, width, pdf=pdf)
     found = [{"folder": seeds[0].folder, **summary(seeds)}] if as_json else []
@@ -136,7 +137,7 @@ def _compare(
     known = {run.folder: run for run in past_runs([Path(folder) for folder in folders])}
     past = [known[place] for folder in folders if (place := str(Path(folder))) in known]
     differ = differences_from_first([name for name, _ in named], folders)
-    with _writing(target):
+    with writing(target, ELSEWHERE):
         titles = "; ".join(dict.fromkeys(run.origin.title for run in past))
         page = pages.compare(target, named, source=titles, differences=differ)
     if as_json:
@@ -151,24 +152,12 @@ def _compare(
     return 0
 
 
-@contextmanager
-def _writing(target: str | Path) -> Iterator[None]:
-    """Raises RecordingError if `target` cannot be written inside."""
-    from experiments.recording.reader import RecordingError
-
-    try:
-        yield
-    except OSError as error:
-        why = f"{target}: cannot be written: {error.strerror}; choose another place with --out"
-        raise RecordingError(why) from None
-
-
 def _put(text: str, out: str | None) -> None:
     """Print a text, or write it into a file and print where that is."""
     if out is None:
         print(text)
         return
-    with _writing(out):
+    with writing(out, ELSEWHERE):
         Path(out).parent.mkdir(parents=True, exist_ok=True)
         Path(out).write_text(f"{text}\n", encoding="utf-8")
     print(out)
