@@ -9,7 +9,8 @@ import inspect
 import math
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from types import FunctionType
 from typing import Any, Final
 
@@ -46,6 +47,11 @@ MATH: Final = {  # functions of `math`, with the types of their values
 BUILTINS: Final = {"abs", "bool", "float", "int", "len", "max", "min", "round"}
 NEW_SUMS: Final = (3, 12)  # Python that adds floats in another way
 NUMBER_OF: Final[dict[type, str]] = {RobotFacts: "number", Neighbour: "sender"}  # attribute with the number of a name
+
+
+@cache
+def parameters_of(function: Callable[..., Any]) -> Mapping[str, inspect.Parameter]:
+    return inspect.signature(function).parameters
 
 
 class Calls(Expressions):
@@ -145,7 +151,7 @@ class Calls(Expressions):
     def call_quiet(
         self, function: FunctionType, given: list[Value], by_name: Mapping[str, Value], node: ast.AST
     ) -> Value:
-        parameters = inspect.signature(function).parameters
+        parameters = parameters_of(function)
         several = any(each.kind is each.VAR_POSITIONAL for each in parameters.values())
         defaults = {name: each.default for name, each in parameters.items() if each.default is not each.empty}
         rest = [] if several else [*parameters][len(given) :]
@@ -235,7 +241,7 @@ class Calls(Expressions):
     def made(self, owner: Any, node: ast.Call) -> Value:
         """An object that is a value."""
         places, by_name = self.given(node)
-        parameters = inspect.signature(owner).parameters
+        parameters = parameters_of(owner)
         given = dict(zip(parameters, places, strict=False)) | by_name
         if len(given) < len(places) + len(by_name) or not given.keys() <= parameters.keys():
             raise self.error(node, f"a call of {owner.__name__} with other arguments")
