@@ -63,6 +63,7 @@ class Company:
         self._cells: dict[tuple[int, object], tuple[CellProcess, object]] = {}  # key: id of the plug-in, robot
         self._codes: dict[int, int] = {}  # exit codes by the numbers of processes
         self.processes: list[int] = []  # numbers of all cells that there were
+        self.flies = False  # a flight that counts: laws of links have a cell for each link then
 
     def ask(self, plugin: Any, robot: object, method: str, *arguments: object) -> Any:  # noqa: ANN401 - of any kind
         """Answer of the plug-in of a robot: numbers, texts, lists and dictionaries; raises PluginError."""
@@ -102,7 +103,8 @@ class Company:
             raise PluginError(f"{files.plain(stand_in.CHOICE)} declares what cannot be used: {error}") from None
 
     def leave(self) -> None:
-        """End the cells: those of the next flight know nothing of this one."""
+        """End the cells: those of the flight that follows know nothing of what was before."""
+        self.flies = True
         for cell, _ in self._cells.values():
             cell.connection.close()
         self._cells.clear()
@@ -195,7 +197,8 @@ def _step(self: Any, view: View, memory: Memory) -> Control:  # noqa: ANN401 - l
 
 
 def _pull(self: Any, apart: Vector, link: Link) -> Vector:  # noqa: ANN401 - likewise
-    answer = self.COMPANY.ask(self, "", "pull", apart, link)
+    company = self.COMPANY
+    answer = company.ask(self, link if company.flies else "", "pull", apart, link)
     try:
         pulled: Vector = msgspec.convert(answer, Vector)
     except msgspec.ValidationError:

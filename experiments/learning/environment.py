@@ -152,6 +152,7 @@ class Environment(ParallelEnv):  # type: ignore[misc] # it has no types
                 self._next = self._first
             self._begin(self.seed)
         self.acts.clear()
+        self.np_random = np.random.default_rng(self.seed)  # wrappers draw from it
         return self._observations(), {agent: {"seed": self.seed} for agent in self.agents}
 
     def _begin(self, seed: int) -> None:

@@ -318,6 +318,21 @@ def test_stand_ins_fly_as_the_law_itself(tmp_path):
         assert alone.metrics == flown.metrics
 
 
+def test_a_gradient_tells_other_robots_nothing(tmp_path):
+    """What one call leaves in a module, no other link of the group's law finds: each has a process of its own."""
+    told = PULL.replace("class Pull", "sides = set()\n\nclass Pull")
+    told = told.replace("far = ", "sides.add(apart[0] > 0.0); far = len(sides) * ")
+    flown = {}
+    for name, text in {"tells": told, "alone": PULL}.items():
+        write({"square.toml": SQUARE, "square.py": text}, tmp_path / name)
+        with company(["square.py:Pull"], tmp_path / name, tmp_path / name, 20, 1 << 30) as cells:
+            cells.leave()
+            flown[name] = simulate(load(tmp_path / name / "square.toml"), seed=3)
+            assert len(cells.processes) >= 3
+    one, other = (next(iter(each.traces.values())) for each in flown.values())
+    assert np.array_equal(one.true_position, other.true_position)
+
+
 @pytest.mark.slow
 def test_errors_are_computed_by_the_course(tmp_path):
     """A group whose law denies its errors, or whose trigger pretends, has not passed."""

@@ -251,6 +251,12 @@ def test_robots_that_touch_end_early():
     assert made.agents == ["CF01"]
 
 
+def test_wrappers_draw_from_the_seed_of_an_episode():
+    made = Environment(load("policy"))
+    drawn = [(made.reset(seed=seed), made.unwrapped.np_random.integers(100, size=5).tolist())[1] for seed in (2, 3, 2)]
+    assert drawn[0] == drawn[2] != drawn[1]
+
+
 def test_talk_is_what_the_agent_says():
     made = Environment(load("policy", duration_s=2.0), "event", talk=True)
     made.reset(seed=1)
