@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 REFRESH_S: Final = 0.25
 LINE_S: Final = 5.0
-QUIET: Final = ("robot",)  # kinds of events that the table shows better
+QUIET: Final = ("robot", "left")  # kinds of events that the table shows better
 ORDERED: Final = ("landing: ordered to ", "done: ordered to stop")  # texts by an operator
 LANDING: Final = ("landing", "stopped", "done")  # phases in which the conductor gives these orders
 
@@ -41,8 +41,8 @@ class Lines:
                 say(f"{event.source}| {event.text}", to=sys.stderr)
             elif event.kind not in QUIET or (event.text.startswith(ORDERED) and progress.phase not in LANDING):
                 when = ""
-                if event.kind in {"hazard", "lost"} and progress.elapsed is not None:
-                    when = f" (at {progress.elapsed - progress.clock.utc() + event.stamp:.1f} s)"
+                if event.kind in {"hazard", "lost"} and progress.start is not None:
+                    when = f" (at {event.stamp - progress.start:.1f} s)"
                 together.setdefault((event.kind, f"{event.text}{when}"), []).append(event.source)
         for (kind, text), sources in together.items():
             say(f"{progress.case}: {kind} {', '.join(dict.fromkeys(sources))}: {text}", to=sys.stderr)

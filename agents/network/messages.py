@@ -174,6 +174,7 @@ class Status(Message, frozen=True):
     incidents: list[Incident] = []  # the last ones, repeated in each status so that a lost status loses none
     stale: dict[str, int] = {}  # samples by neighbour that were older than a known one
     foreign: dict[str, int] = {}  # samples by neighbour from another source than its process
+    ended: float = 0.0  # [s] UTC at which it began to land, or was stopped; 0 before
 
     def incidents_since(self, before: Status | None) -> list[Incident]:
         """Incidents since an earlier status; all, if that is of another process."""

@@ -3,7 +3,8 @@
 End of file means that the launcher is gone, silence that it hangs or that the network to it is cut. This works equally
 for a local process and through ssh, on every operating system.
 
-The heartbeat is an empty line. The emergency stop is a line as well: its second way, which needs no router.
+The heartbeat is an empty line. The emergency stop is a line as well: its second way, which needs no router. So is each
+event of a run, for its recorder.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import select
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Final
 
 from agents.network import messages
@@ -26,6 +28,7 @@ LONGEST: Final = 4096  # longest line [bytes]
 
 GONE: Final = "the starter is gone"  # reason of the loss: gone, or ended
 _STOP: Final = b"stop "
+_EVENT: Final = b"event "
 
 
 def stop_line(stop: messages.Stop) -> bytes:
@@ -37,6 +40,18 @@ def stop_line(stop: messages.Stop) -> bytes:
 def stop_in(line: bytes) -> messages.Stop | None:
     """The emergency stop in a line; None if it has none."""
     return messages.read_stop(line.removeprefix(_STOP), messages.JSON) if line.startswith(_STOP) else None
+
+
+def event_line(event: messages.Event) -> bytes:
+    """Line with an event of a run."""
+    return _EVENT + messages.encode(event) + b"\n"
+
+
+def event_in(line: bytes) -> messages.Event | None:
+    """The event in a line; None if it has none, or one that was too long."""
+    with suppress(messages.Malformed):
+        return messages.decode(line.removeprefix(_EVENT), messages.JSON, messages.Event)
+    return None
 
 
 class LifelineEnd:

@@ -90,6 +90,7 @@ class TelemetryPublisher:
         self._reported: list[tuple[object, ...]] = [()] * len(names)
         self._incidents: list[deque[messages.Incident]] = [deque(maxlen=INCIDENTS) for _ in names]
         self._numbers = [0] * len(names)
+        self._ended = [0.0] * len(names)  # [s] UTC at which each began to land; 0 before
         # whether wheels stand after the end; None once the body has confirmed that, or that its motors are off
         self._resting: list[Standing | None] = [Standing() for _ in names]
 
@@ -163,6 +164,7 @@ class TelemetryPublisher:
         for row, robot in enumerate(self._robots):
             life, missing = robot.lifecycle, robot.missing_neighbours()
             phase = self._phase(row)
+            self._ended[row] = (self._ended[row] or self.utc + t) if phase >= Phase.LANDING else 0.0
             news = (phase, messages.without_numbers(life.reason), tuple(missing), self._numbers[row])
             if not everything and news == self._reported[row]:
                 continue
@@ -205,6 +207,7 @@ class TelemetryPublisher:
             avoided=robot.evasions,
             late_s=counts.late_s,
             started=self.utc + life.start_at if isfinite(life.start_at) else 0.0,
+            ended=self._ended[row],
             missing=missing,
             pid=os.getpid(),
             cpu_s=time.process_time(),
@@ -246,8 +249,9 @@ class TelemetryPublisher:
         """Repeats the last statuses with another `reason`; from any thread, while the loop hangs."""
         for publisher, status in zip(self._statuses, self._last, strict=True):
             if status is not None:
-                phase = "landing" if status.phase in UNDER_WAY else status.phase
-                repeated = msgspec.structs.replace(status, stamp=stamp, phase=phase, reason=reason)
+                down = status.phase in UNDER_WAY
+                phase, ended = ("landing", stamp) if down else (status.phase, status.ended)
+                repeated = msgspec.structs.replace(status, stamp=stamp, phase=phase, reason=reason, ended=ended)
                 publisher.put(messages.encode(repeated, self._encoding))
 
 

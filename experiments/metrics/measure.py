@@ -17,11 +17,10 @@ import numpy as np
 
 from agents.decision.lifecycle import TOLD_TO_END
 from agents.network.messages import Event
-from agents.safety.hazards import BY_OPERATOR, OVER, QUIET_S, UNRESOLVED, Cause
+from agents.safety.hazards import BY_OPERATOR, OVER, QUIET_S, UNRESOLVED, Cause, failed, is_blind
 from experiments.definition import link_conditions
 from experiments.metrics import centralised
 from experiments.metrics.comparable import STOOD, reasons
-from experiments.metrics.failures import failed_robots, moment
 from experiments.metrics.metric import (
     DETAILS,
     OF_LAW,
@@ -46,7 +45,12 @@ NAMED_S: Final = 0.05  # [s] shorter holds are not named
 # causes of holds that are not part of an experiment
 HOLDING: Final = (Cause.ORDERED, Cause.POSITION, Cause.ROUTER, Cause.CENTRE, Cause.SUSPENDED)
 CHANGES: Final = {"remove": "removed", "restart": "restarted", "replace": "replaced"}  # orders to the conductor
-ENDED: Final = ("silent", "killed", "changed")  # orders after which the former process of a robot ends, or has ended
+ENDED: Final = (
+    "silent",
+    "killed",
+    "left",
+    "changed",
+)  # orders after which the former process of a robot ends, or has ended
 LEAVING: Final = ("ordered to leave", TOLD_TO_END)  # reasons of a robot that lands for one of them
 
 
@@ -151,12 +155,26 @@ def _robots(shared: Measurement, values: Mapping[str, Sequence[float | None]]) -
 
 
 def failures(trace: Trace, known: Sequence[float]) -> tuple[str, ...]:
-    """A sentence about each robot that did not do its part of the experiment, and about a recording that breaks off.
+    """The first thing that kept each robot from its part of the experiment, and a cut of its motors after that.
 
     Args:
         known: (N,) share of the time at which the position of each robot is known.
     """
-    found = failed_robots(trace.events, trace.robots)
+    found: dict[str, str] = {}
+    blind: dict[str, Event] = {}  # begin of the last loss of its own position
+    for event in trace.events:
+        lost = event.kind in {"lost", "failed"} or (event.kind == "hazard" and failed(event.text))
+        if event.kind == "hazard" and event.text.startswith("hold: ") and is_blind(event.text):
+            blind[event.source] = event
+        if lost and event.source in trace.robots and event.source not in found:
+            what = f"was lost: {event.text}" if event.kind == "lost" else event.text.removeprefix("warn: ")
+            begin = event
+            if event.text.startswith(UNRESOLVED) and event.source in blind:
+                begin = blind[event.source]
+                what = f"{begin.text.removeprefix('hold: ')}, until the end"
+            found[event.source] = f"{event.source} {_moment(begin)}: {what}"
+        elif event.text.startswith("cut: ") and "cut: " not in found.get(event.source, "cut: "):
+            found[event.source] += f"; {_moment(event)} {event.text}"
     taken_out = _taken_out(trace)
     for name, share in zip(trace.robots, known, strict=True):
         if share < PRESENT and name not in taken_out:
@@ -165,6 +183,11 @@ def failures(trace: Trace, known: Sequence[float]) -> tuple[str, ...]:
         planned = trace.plan.experiment.duration_s
         found[""] = f"the recording breaks off after {trace.time[-1]:.1f} s of {planned:g} s"
     return tuple(found.values())
+
+
+def _moment(event: Event) -> str:
+    """Time of an event, in words."""
+    return f"at {abs(event.stamp):.1f} s" if event.stamp > -0.05 else f"{-event.stamp:.1f} s before the start"
 
 
 def _landed_by_conductor(trace: Trace) -> bool:
@@ -186,7 +209,7 @@ def _taken_out(trace: Trace) -> dict[str, str]:
         else:
             continue
         if name in asked and name in left and event.stamp <= trace.time[-1]:
-            found.setdefault(name, f"{name} was {asked[name]} {BY_OPERATOR} {moment(event)}")
+            found.setdefault(name, f"{name} was {asked[name]} {BY_OPERATOR} {_moment(event)}")
     return found
 
 
@@ -255,7 +278,7 @@ def _redirected(trace: Trace) -> list[str]:
     found: dict[str, str] = {}
     for event in trace.events:
         if event.kind == "hazard" and event.text.startswith("warn: ") and event.text.endswith(BY_OPERATOR):
-            sentence = f"{event.source} {event.text.removeprefix('warn: ')} {moment(event)}"
+            sentence = f"{event.source} {event.text.removeprefix('warn: ')} {_moment(event)}"
             found.setdefault(event.source, sentence)
     return [*found.values()]
 

@@ -102,8 +102,9 @@ class Correction:
         return replace(state, stamp=self(state.robot, state.stamp), received=received, goal_receipts=receipts)
 
     def status(self, status: Status) -> Status:
-        """A status with its stamp and its start corrected."""
-        return replace(status, stamp=self(status.robot, status.stamp), started=self(status.robot, status.started))
+        """A status with its stamp, its start and its end corrected."""
+        stamp, started, ended = (self(status.robot, at) for at in (status.stamp, status.started, status.ended))
+        return replace(status, stamp=stamp, started=started, ended=ended)
 
     def offsets(self) -> tuple[ClockOffset, ...]:
         found = []

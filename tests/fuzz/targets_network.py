@@ -135,7 +135,7 @@ def recorder(net):
 @renewed(500, THREE, 60_000)
 def conductor(net):
     """The conductor follows the robots' statuses, states and tokens, and changes robots when it is asked."""
-    changes = dict.fromkeys(("start", "stop", "release", "kill"), lambda *_, **__: SimpleNamespace())
+    changes = dict.fromkeys(("start", "stop", "release", "kill", "tell"), lambda *_, **__: SimpleNamespace())
     launcher = SimpleNamespace(last_silence=-np.inf, died=list, running=lambda _name: False, land_s=15.0, **changes)
     with tempfile.TemporaryDirectory() as name:
         folder, hosts = Path(name), Hosts(launcher, [])

@@ -153,6 +153,10 @@ class Link:
         """Whether nothing passes now; it is held."""
         return self.near.cut or self.far.cut or self.parted
 
+    def arrives(self, node: Node) -> bool:
+        """Whether messages to an end are under way."""
+        return self._due[node] > current().now
+
     def other(self, node: Node) -> Node:
         return self.far if node is self.near else self.near
 

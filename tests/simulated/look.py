@@ -134,7 +134,9 @@ class Look:
         link = None if session is None else session.link
         if session is None or link is None or not link.open() or (session.slow >= 100 and not slowly):
             return False
-        return not (link.out or link.far.process.paused)
+        if link.out:
+            return False
+        return not link.far.process.paused or (slowly and link.arrives(session))  # what it sent before
 
     @cached_property
     def kinds(self) -> set[str]:

@@ -119,7 +119,7 @@ def _misled(look: Look, seen: Seen) -> bool:
 
 @rule(OF_ROBOTS, "its landing makes no progress for this time")
 def descent(look: Look, seen: Seen) -> str:
-    lands = seen.phase == LANDING and seen.flying and not _misled(look, seen)
+    lands = seen.phase == LANDING and seen.flying and seen.governed and not _misled(look, seen)
     lasted = look.lasting(("descent", seen.name), lands, 12.0)
     return f"lands for {lasted:.1f} s, at {seen.motion.position}" if lasted and seen.motion else ""
 

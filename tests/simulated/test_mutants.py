@@ -168,9 +168,16 @@ MUTANTS = {
         "bridges/measured_flight.py", "down = came_down or grounded_s > GROUNDED_S", "down = True",
         partial(test_safety.test_robot_ordered_down_in_its_climb_lands, "loss"),
     ),
-    "failures of the recording alone": (
-        f"{CONDUCTOR}conductor.py", "*failed_robots(events, self._robots).values(), ", "",
+    "events on the network alone": (
+        f"{CONDUCTOR}run_view.py", "self._launcher.tell(self._recorder, event_line(event))", "pass",
         run("told_too_late_for_the_recorder"),
+    ),
+    "landing that is as late as its news": (
+        f"{CONDUCTOR}conductor.py", "view.status.ended + view.clock_off - start", "view.status.stamp - start",
+        run("stopped_while_the_run_was_cut_off"),
+    ),
+    "hold that is as late as its news": (
+        f"{CONDUCTOR}run_view.py", "min(at + view.clock_off, now)", "now", run("held_while_the_run_was_cut_off"),
     ),
     "thawed launcher goes on": (
         f"{CONDUCTOR}run_view.py", "if self._launcher.last_silence > self._begun:", "if False:",

@@ -68,9 +68,19 @@ ROWS = {
     "restarted": Run(3, "B was restarted by an operator at 1.", order(1.0, "restart")),
     "replaced": Run(3, "B was replaced by an operator at 1.", order(1.0, "replace --body twin")),
     "interrupted": Run(130, "Interrupted after 1.0 s of 3 s", (Fault(1.0, "interrupt"),)),
+    "stopped_while_the_run_was_cut_off": Run(
+        1,
+        "B landed after 1.0 of 3 s: ordered to stop by an operator",
+        (Fault(0.5, "cut", "conductor", lasts=5.0), *order(1.0, "stop")),
+    ),
+    "held_while_the_run_was_cut_off": Run(
+        3,
+        "B was held by an operator for 2.0 of 3 s",
+        (Fault(0.5, "cut", "conductor", lasts=5.0), *order(1.0, "hold"), Fault(5.0, "slow", "conductor", 1500, 20.0)),
+    ),
     "told_too_late_for_the_recorder": Run(  # seed 130855
         1,
-        "B at 4.1 s: land: its control loop hangs",
+        "B at 3.6 s: land: its control loop hangs",
         (
             Fault(2.985, "hang", "B", 0.8),
             Fault(3.2, "cut", "conductor", lasts=0.9),
@@ -81,13 +91,20 @@ ROWS = {
     "recorder_hangs_to_the_end": Run(
         1, "the recording breaks off after", (Fault(1.0, "pause", "recorder", lasts=inf),)
     ),
-    "recorder_cut_off": Run(1, "failed: no begin of a robot", (Fault(-0.3, "cut", "recorder", lasts=20.0),)),
+    "recorder_cut_off": Run(
+        1, "A: its position was known for 0% of the time only", (Fault(-0.3, "cut", "recorder", lasts=20.0),)
+    ),
     "disk_full": Run(1, "cannot be written: No space left", (Fault(1.0, "disk", "recorder", "full"),)),
     "stood_still": Run(2, "this process stood still for more than 3 s", frozen("conductor", 5.0)),
     "router_restarted": Run(
         0, "the router ended (killed by SIGKILL) after 1.0 s, and was", (Fault(1.0, "kill", "router"),)
     ),
-    "centre_restarted": Run(0, "A, B held for up to 0.1 of 3 s: it gets no goals; the centre ended", (KILLED,), CENTRE),
+    "centre_restarted": Run(
+        0,
+        "A, B held for up to 0.4 of 3 s: it gets no goals; the centre ended",
+        (*frozen("conductor", 0.4), KILLED),
+        CENTRE,
+    ),
     "stood": Run(3, "A, B stood for up to 1.", (*frozen("conductor", 1.2), KILLED), (*CENTRE, "duration_s=4")),
     "criterion_met": Run(0, "Passed: 1 of 1", experiment=PAIR + LIMIT.format(11)),
     "criterion_not_met": Run(1, "Few messages are wanted.", experiment=PAIR + LIMIT.format(9)),

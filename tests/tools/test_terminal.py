@@ -137,6 +137,7 @@ def test_errors_from_before_routers_silence_are_no_news(kind, capsys):
 def test_hazard_is_printed_with_its_beginning(capsys):
     progress = Progress("event", "formation", 9.0, 15.0, {})
     stamp = progress.clock.utc()
+    progress.start = stamp - 9.0
     progress.events += [
         messages.Event(stamp - 0.5, "hazard", "Q1", "hold: its own position is lost"),
         messages.Event(stamp, "phase", "conductor", "formation"),
@@ -150,7 +151,7 @@ def test_hazard_is_printed_with_its_beginning(capsys):
 
 def test_orders_to_several_robots_are_one_line(capsys):
     progress = Progress("event", "formation", 9.0, 15.0, {})
-    names = ("A", "B", "C")
+    progress.start, names = progress.clock.utc() - 9.0, ("A", "B", "C")
     for kind, text in (("hazard", "hold: ordered to hold: by an operator"), ("robot", "landing: ordered to land")):
         progress.events += [messages.Event(progress.clock.utc() - 0.55, kind, name, text) for name in names]
     for text in ("done: finished", "running: ordered to hold", "done: ordered to land"):

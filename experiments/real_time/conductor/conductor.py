@@ -7,14 +7,12 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
 from typing import Final
-
-from msgspec.structs import replace
 
 from agents.clock import Clock
 from agents.decision.lifecycle import PAUSED, TOLD_TO_END
@@ -22,7 +20,6 @@ from agents.network import messages
 from agents.network.keys import Keys
 from agents.runtime.orders import LAND, STOP
 from experiments.file.document import write_json
-from experiments.metrics.failures import failed_robots
 from experiments.real_time.conductor import run_view
 from experiments.real_time.conductor.case_processes import CaseContext, CaseProcesses
 from experiments.real_time.conductor.hot_changes import HotChanges
@@ -122,6 +119,8 @@ class Conductor(CaseRun):
                         self._report_unbegun()
                 self._land()
                 if start is not None:
+                    if not self._context.ended():
+                        self._note_landings(start)
                     self._drift.close()
                     self._view.report_drift(*self._drift.news())
                 for name in self._processes.end_robots():
@@ -134,10 +133,8 @@ class Conductor(CaseRun):
             self._processes.end()
             parted = self._processes.join_parts()
         lost = tuple(name for name, view in self._robots.items() if view.left_because == "lost")
-        # the last events may have come too late for the recorder
-        zero = inf if start is None else start
-        events = [replace(event, stamp=event.stamp - zero) for event in self._progress.events]
-        failures = [*failed_robots(events, self._robots).values(), *self.failures, *([parted] if parted else [])]
+        failures = [*([f"lost {', '.join(lost)}"] if lost else []), *self._landings(), *self.failures]
+        failures += [parted] if parted else []
         landed = [f"{', '.join(names)} {reason} by an operator" for (reason, _), names in self._landed.items()]
         held = [f"{', '.join(sorted(self._held))} held by an operator to the end"] if self._held else []
         halted = "; ".join([*landed, *held])
@@ -261,7 +258,7 @@ class Conductor(CaseRun):
         coming = deque(self._experiment.phases)
         end = start + self._experiment.duration_s
         self._changes.begin(start)
-        self._repeat_at = start
+        self._repeat_at = self._progress.start = start
         self._progress.phase = "starting together"
         while (now := self._clock.utc()) < end + OVER_S and not self._context.ended():
             self._update()
@@ -276,16 +273,13 @@ class Conductor(CaseRun):
             busy = self._changes.under_way
             left = [view for name, view in self._robots.items() if not view.gone and name not in busy]
             ended = all(view.reached("landing") for view in left) and (left or not busy)
-            if now < end - EARLY_S:
-                self._note_landings(now - start, busy)
-                if ended and not self._landed:
-                    what = "all robots were down" if left else "no robot was left"
-                    self.failures.append(f"{what} after {now - start:.1f} of {self._experiment.duration_s:g} s")
+            self._note_landings(start)
+            if ended and now < end - EARLY_S and not self._landed:
+                what = "all robots were down" if left else "no robot was left"
+                self.failures.append(f"{what} after {now - start:.1f} of {self._experiment.duration_s:g} s")
             if ended:
                 break
             time.sleep(POLL_S)
-        for (reason, when), names in self._landed.items():
-            self.failures.append(f"{', '.join(names)} landed {when}: {reason} by an operator")
 
     def _note_holds(self) -> None:
         """Note which robots hold by order; one that lands at the end does not say so any more."""
@@ -295,15 +289,22 @@ class Conductor(CaseRun):
             elif view.phase == "running":
                 self._held.add(name)
 
-    def _note_landings(self, elapsed: float, busy: Container[str]) -> None:
+    def _note_landings(self, start: float) -> None:
         """Note robots that others have ordered to land or to stop before the end: the run is spoilt without a fault."""
-        known = {name for names in self._landed.values() for name in names}
+        known, busy = {name for names in self._landed.values() for name in names}, self._changes.under_way
+        duration_s = self._experiment.duration_s
         for name, view in self._robots.items():
-            if view.gone or name in busy or name in known or not view.reached("landing"):
+            if view.status is None or view.gone or name in busy or name in known or not view.reached("landing"):
                 continue
-            if (reason := self._reason(name)).startswith((LAND, STOP, TOLD_TO_END)):
-                when = f"after {elapsed:.1f} of {self._experiment.duration_s:g} s"
-                self._landed.setdefault((reason, when), []).append(name)
+            after_s = max(0.0, view.status.ended + view.clock_off - start)
+            if after_s < duration_s - EARLY_S and view.status.reason.startswith((LAND, STOP, TOLD_TO_END)):
+                self._landed.setdefault((view.status.reason, f"after {after_s:.1f} of {duration_s:g} s"), []).append(
+                    name
+                )
+
+    def _landings(self) -> list[str]:
+        """Sentences about the robots of `_note_landings`."""
+        return [f"{', '.join(who)} landed {when}: {why} by an operator" for (why, when), who in self._landed.items()]
 
     def _start_late(self, start: float) -> None:
         """Repeat the start to robots that still wait: a busy machine may have lost the order, or its answer."""

@@ -246,6 +246,8 @@ class HotChanges:
             if past > land_s + SILENT_S:
                 raise Refusal(f"{', '.join(still)}: cannot be ended")
             yield
+        for name in present:
+            self._view.report("left", name, "it is down, and has left the run")
         for name in names:
             self._robots[name].left_because = "removed"
             self._robots[name].forget_process()

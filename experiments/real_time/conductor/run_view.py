@@ -20,7 +20,7 @@ from agents.network import session as network
 from agents.network.endpoints import DEFAULT_ENDPOINT
 from agents.network.keys import Keys
 from agents.network.shutdown import closing_cleanly
-from agents.runtime.lifeline import SILENCE_S
+from agents.runtime.lifeline import SILENCE_S, event_line
 from experiments.definition import mesh
 from experiments.file import document
 from experiments.real_time.conductor import orders
@@ -105,6 +105,7 @@ class Progress:
     states: list[messages.State] = field(default_factory=list)  # states of the last update
     silent_since: float = inf  # [s, monotonic] begin of the silence of the routers
     clock: Clock = field(default_factory=Clock)
+    start: float | None = None  # [s, UTC] common start; None before it is known
 
 
 class EventFeed:
@@ -149,6 +150,7 @@ class NetworkView:
         self.clock, self.robots = progress.clock, progress.robots
         self._progress = progress
         self._launcher, self._begun = context.launcher, uptime()
+        self._recorder = context.process("recorder")
         experiment, endpoints = context.plan.experiment, context.endpoints
         self._keys = keys = Keys(experiment.network.realm)
         identity, rights = context.identity, mesh.member_rights(context.plan, endpoints)
@@ -228,10 +230,11 @@ class NetworkView:
         return orders.send_order(self.session, self._keys, names, order)
 
     def report(self, kind: str, source: str, text: str, stamp: float | None = None) -> None:
-        """Report an event of the run, now or at `stamp` [s, UTC]."""
+        """Report an event of the run, now or at `stamp` [s, UTC]; a conductor that is cut off reaches its recorder."""
         event = messages.Event(self.clock.utc() if stamp is None else stamp, kind, source, text)
         self._progress.events.append(event)
         self._events.put(messages.encode(event))
+        self._launcher.tell(self._recorder, event_line(event))
 
     def report_clocks(self, clocks: Iterable[messages.HostClock]) -> None:
         """Report the offsets of the hosts' clocks, for the recording."""
@@ -266,12 +269,20 @@ class NetworkView:
         if status.phase not in ORDER or status.pid == view.former:
             return
         view.seen = min(view.seen, time.monotonic())
+        now = self.clock.utc()
+        view.behind = min(view.behind, now - status.stamp)
+
+        def report(kind: str, text: str, at: float) -> None:
+            """Report what was at a time of the robot's clock, of which the news may be late."""
+            self.report(kind, status.robot, text, min(at + view.clock_off, now))
+
         if view.status is not None and _plain(view.status) != _plain(status):
-            self.report("robot", status.robot, status.phase + (f": {status.reason}" if status.reason else ""))
+            at = status.stamp if view.reached("landing") else status.ended or status.stamp
+            report("robot", status.phase + (f": {status.reason}" if status.reason else ""), at)
         for incident in status.incidents_since(view.status):
-            self.report("hazard", status.robot, incident.text)
+            report("hazard", incident.text, incident.stamp)
         if _fell_out(view.status, status):
-            self.report("hazard", status.robot, f"land: {status.reason}")
+            report("hazard", f"land: {status.reason}", status.ended)
         note = messages.without_numbers(status.body)
         if note != view.note:
             view.note = note
@@ -280,7 +291,6 @@ class NetworkView:
             view.began = status.stamp
         view.status = status
         view.origin = status.origin or view.origin
-        view.behind = min(view.behind, self.clock.utc() - status.stamp)
 
 
 def _plain(status: messages.Status) -> tuple[str, str]:

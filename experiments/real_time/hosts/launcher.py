@@ -248,6 +248,13 @@ class Launcher:
             process.write()
         return process
 
+    def tell(self, name: str, line: bytes) -> None:
+        """Send a line on the lifeline of a process, behind all that it has not read yet."""
+        with self._lock:
+            if name in self._processes:
+                self._processes[name].unsent += line
+                self._processes[name].write()
+
     def send_line(self, process: Process, line: bytes) -> None:
         """Send a line on the lifeline of a process; it is dropped if the process has not read the last one."""
         with self._lock:

@@ -23,6 +23,7 @@ from agents.network.keys import Keys
 from agents.network.messages import M
 from agents.network.shutdown import AFTER_S, end
 from agents.runtime import command_line
+from agents.runtime.lifeline import event_in
 from agents.ticks import POLL_S
 from experiments.real_time.processes.joining import Launch, joined
 from experiments.recording.topics import DEPTH, RARE, TOPICS, Message, Topic
@@ -38,7 +39,11 @@ CDR: Final = "application/cdr"
 
 
 class Recorder:
-    def __init__(self, session: zenoh.Session, keys: Keys, recording: Recording) -> None:
+    def __init__(
+        self, session: zenoh.Session, keys: Keys, recording: Recording, lines: deque[bytes] | None = None
+    ) -> None:
+        """Subscribe to all; `lines` are those of the lifeline, which may have events as well."""
+        self._lines, self._events = deque[bytes]() if lines is None else lines, set[messages.Event]()
         self._keys, self._recording = keys, recording
         self._session = session
         self._utc = Clock().utc
@@ -63,6 +68,9 @@ class Recorder:
         for topic, inbox in self._inboxes:
             for message, sample in inbox.read_samples(_require_finite if topic.finite else None):
                 self._store(message, sample)
+        while self._lines:
+            if (event := event_in(self._lines.popleft())) is not None:
+                self._store_event(event)
         for event in self._world_events.read(validation.check_world_event):
             self._recording.write(event)
         now = time.monotonic()
@@ -97,10 +105,18 @@ class Recorder:
 
     def _store(self, message: Message, sample: zenoh.Sample) -> None:
         mime = str(sample.encoding)
-        if isinstance(message, messages.State) and message.true_position is None and message.robot in self._truth:
+        if isinstance(message, messages.Event):
+            self._store_event(message)
+        elif isinstance(message, messages.State) and message.true_position is None and message.robot in self._truth:
             self._queues.setdefault(message.robot, deque()).append((time.monotonic(), message, mime))
         else:
             self._recording.write(message, sample.payload.to_bytes(), mime)
+
+    def _store_event(self, event: messages.Event) -> None:
+        """Stores an event that has not come on the other way."""
+        if event not in self._events:
+            self._events.add(event)
+            self._recording.write(event)
 
     def _store_truth(self, truth: messages.Position) -> None:
         """Stores the true pose that a protocol twin publishes: its bridge cannot know it."""
@@ -156,9 +172,12 @@ def record(launch: RecorderLaunch) -> int:
     plan, endpoints = launch.read()
     text = Path(launch.source).read_text("utf-8")
     lost, asked = threading.Event(), threading.Event()
+    lines = deque[bytes]()
     target, seed = Path(launch.target), plan.experiment.seed
     with (
-        joined(plan, endpoints, name="recorder", stop=asked, on_signal=asked.set, lost=lost) as joint,
+        joined(
+            plan, endpoints, name="recorder", stop=asked, on_signal=asked.set, lost=lost, on_line=lines.append
+        ) as joint,
         Recording(
             target,
             plan,
@@ -171,7 +190,7 @@ def record(launch: RecorderLaunch) -> int:
             utc=Clock().utc,
         ) as recording,
     ):
-        recorder = Recorder(joint.session, joint.keys, recording)
+        recorder = Recorder(joint.session, joint.keys, recording, lines)
         joint.declared.append(recorder)
         router = network.RouterWatch(joint.session, joint.keys.recorder, endpoints)
         flush_at = time.monotonic() + FLUSH_S

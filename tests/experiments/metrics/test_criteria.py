@@ -193,6 +193,7 @@ def changed_by(who, word="remove", leaves=("robot", "landing: ordered to leave")
         (changed_by("ann"), "CF01 was removed by an operator at 2.1 s"),
         (changed_by("ann", "restart", ("silent", "its lifeline is cut")), "CF01 was restarted by an operator at 2.1 s"),
         (changed_by("an operator", "replace"), "CF01 was replaced by an operator at 2.1 s"),
+        (changed_by("ann", "replace", ("left", "it is down")), "CF01 was replaced by an operator at 2.1 s"),
         (changed_by("on_loss", "restart"), None),
         (changed_by("ann")[:1], None),
         (given(1.0, 2.0), "CF01 was given trigger.threshold = 0.02 by an operator at 1.0 s"),

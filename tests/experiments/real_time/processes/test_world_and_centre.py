@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import types
+from collections import deque
 from contextlib import ExitStack
 from pathlib import Path
 from unittest.mock import Mock
@@ -24,6 +25,7 @@ from agents.network.name_ownership import NameTaken, OwnershipCheck, OwnershipTi
 from agents.network.shutdown import FAREWELL_S, STOPPED_S
 from agents.robot import Robot
 from agents.runtime.goal_inbox import GoalInbox
+from agents.runtime.lifeline import event_line
 from agents.vectors import NO_SETPOINT
 from experiments.definition.experiment import Arena, Formation, RobotTable, WorldTable
 from experiments.definition.plan import Plan
@@ -356,6 +358,18 @@ def test_recorder_keeps_plausible_messages_of_the_world():
             recorder.report_malformed(last=last)
     told = [(event.kind, event.source, event.text.split(" on ")[1].split(": ")[0]) for event in taken]
     assert sorted(told) == [("unread", "recorder", key) for key in sorted((KEYS.contact, KEYS.world))]
+
+
+def test_recorder_writes_each_event_once_whichever_way():
+    first, second, third = (messages.Event(START + at, "late", "KH01", "waits") for at in (0.0, 1.0, 2.0))
+    taken = []
+    with Net().worn() as net:
+        lines = deque([event_line(first), event_line(second)[:9], b"stop {}", event_line(third)])
+        recorder = Recorder(net.session, KEYS, Taken(taken), lines)
+        for event in (first, second):
+            net.deliver(sent(KEYS.event, event)[1])
+        recorder.receive()
+    assert sorted(taken, key=lambda event: event.stamp) == [first, second, third]
 
 
 def test_world_speaks_for_itself_alone():
