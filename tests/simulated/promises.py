@@ -150,6 +150,7 @@ HOSTS: Final = {
     "0.15 s after the split in": f"{SPLIT}{BEYOND}",
     "absent for a second. In": f"{SPLIT}{BEYOND}",
     "warn 2 s after its token": f"{SPLIT}conductor_beyond_is_missed_and_the_robots_finish",
+    "Exit code 1 in both cases": f"{SPLIT}stop_names_what_it_does_not_reach",
     "At most 0.15 s after that (0.11 s with": f"{SPLIT}of_two_owners_the_later_one_ends",
     "any more, and ends with 2.": f"{SPLIT}of_two_owners_the_later_one_ends",
     "to all robots within 1 s": f"{MACHINES}estop_typed_on_a_machine_stops_all",

@@ -7,7 +7,7 @@ import pytest
 
 from tests.simulated.faults import Fault
 from tests.simulated.laboratory import fly
-from tests.simulated.small import TICK_S, TRIO
+from tests.simulated.small import DRONE, TICK_S, TRIO
 
 SOON_S = 2.5 * TICK_S
 MEET_S = 0.15  # time from the end of a split until its routers are linked, and tokens have passed
@@ -62,6 +62,27 @@ def test_order_to_a_robot_beyond_is_refused():
     (answer,) = flight.answers
     assert (answer.code, "no answer" in answer.output) == (1, True)
     assert flight.robots["B"].phases[-1].reason == "finished"
+
+
+STOPS = {
+    "estop": ("", "A C", 0),  # lifelines reach the robots beyond
+    "estop --connect tcp/127.0.0.1:7447 --connect tcp/127.0.0.1:7448": ("", "A C", 1),  # it knows of no run
+    "estop --connect tcp/127.0.0.1:7448 --connect tcp/127.0.0.1:7447": (" operator", "C", 1),
+}
+
+
+@pytest.mark.parametrize("command", STOPS)
+def test_stop_names_what_it_does_not_reach(command):
+    beyond, stopped, code = STOPS[command]
+    parts, stop = Fault(0.5, "split", f"router2 C{beyond}", lasts=8.0), Fault(4.505, "command", "", command)
+    flight = split(parts, stop, experiment=DRONE, settings=["duration_s=6"])
+    for name, robot in flight.robots.items():
+        cut = [phase.t for phase in robot.phases if phase.reason.startswith("emergency stop")]
+        assert [t < stop.at + 0.1 for t in cut] == [True] * (name in stopped)
+    (answer,) = flight.answers
+    assert answer.code == code
+    assert ("where no router answers, are NOT known to have stopped" in answer.output) == (code == 1)
+    assert flight.violations == []
 
 
 # end of the split, start of the second process, its clock [s]; who keeps the name, and more faults

@@ -373,7 +373,13 @@ def _as_json(stop: EmergencyStop, *, dry_run: bool) -> Mapping[str, object]:
         found = {"would_be_stopped": sorted(seen)}
     else:
         found = {"stopped": sorted(seen - moving), "not_known_to_have_stopped": sorted(moving)}
-    return {"where": stop.where, **found, "failure": failure, "run_asked_to_end": stop.run_ended or stop.answered}
+    return {
+        "where": stop.where,
+        **found,
+        "failure": failure,
+        "unreached": stop.unreached,
+        "run_asked_to_end": stop.run_ended or stop.answered,
+    }
 
 
 def _print_stop(stop: EmergencyStop, *, dry_run: bool) -> None:
@@ -393,6 +399,9 @@ def _print_stop(stop: EmergencyStop, *, dry_run: bool) -> None:
         say(f"also tried, {stop.where}: {why}", to=sys.stderr)
     elif stop.failure is not None:
         say(f"its routers were not reached: {why}", to=sys.stderr)
+    if stop.unreached and (stop.run is None or not stop.answered):
+        done = "are not known" if dry_run else "are NOT known to have stopped"
+        say(f"robots at {', '.join(stop.unreached)}, where no router answers, {done}", to=sys.stderr)
     if stop.run_ended:
         say(f"its process was asked to end: {stop.where}", to=sys.stderr)
 

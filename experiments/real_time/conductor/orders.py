@@ -164,6 +164,7 @@ class EmergencyStop:
     strangers: set[str] = field(default_factory=set)
     moving_strangers: set[str] = field(default_factory=set)
     failure: Exception | None = None  # why the routers cannot be reached
+    unreached: list[str] = field(default_factory=list)  # those of several routers that do not answer
     answered: bool = False  # whether the process of the run has taken the stop, which ends the run
     run_ended: bool = False  # whether it was asked to end, since neither it nor a robot has answered
 
@@ -180,17 +181,15 @@ class EmergencyStop:
     def missed(self) -> bool:
         """Whether robots may go on: some have not reported, or the stop did not reach a run that is up."""
         silent = self.expected or (self.run is not None and self.failure is not None)
-        return bool(self.moving or self.moving_strangers) or (silent and not (self.seen or self.answered))
+        doubt = (silent and not (self.seen or self.answered)) or (self.run is None and bool(self.unreached))
+        return bool(self.moving or self.moving_strangers) or doubt
 
     def send(self, reason: str) -> None:
         """Send the stop both ways until every robot that is alive reports that it has stopped."""
         stop = messages.Stop(self.identity, reason)
         with ThreadPoolExecutor(1) as pool:  # neither way waits for the other
             asked = None if self.run is None else pool.submit(run_registry.tell, self.run, stop)
-            try:
-                self._send(stop, lambda: _stopped(asked))
-            except Exception as error:  # noqa: BLE001 - the others are stopped whatever happens to this one
-                self.failure = error
+            self._at_each_router(lambda routers: self._send(routers, stop, lambda: _stopped(asked)))
             report = None if asked is None else asked.result()
         self._set_strangers_apart()
         unseen = not self.seen
@@ -203,13 +202,40 @@ class EmergencyStop:
 
     def look(self) -> None:
         """Find the robots that the stop would reach; nothing is sent to them."""
-        try:
-            opened = network.open_session(self.endpoints, name="estop", wait_s=2.0, identity=self.identity)
+
+        def see(routers: Sequence[str]) -> tuple[set[str], set[str]]:
+            opened = network.open_session(routers, name="estop", wait_s=2.0, identity=self.identity)
             with closing_cleanly(opened) as (session, _):
-                self.seen = alive(session, Keys(self.realm))
-        except Exception as error:  # noqa: BLE001 - as for the stop itself
-            self.failure = error
+                return alive(session, Keys(self.realm)), set()
+
+        self._at_each_router(see)
         self._set_strangers_apart()
+
+    def _at_each_router(self, act: Callable[[Sequence[str]], tuple[set[str], set[str]]]) -> None:
+        """Act at all routers at once, and note which robots are there, and which of them move.
+
+        Routers share their robots, unless the network between them is split.
+        """
+
+        def attempt(routers: Sequence[str]) -> tuple[set[str], set[str]] | Exception:
+            try:
+                return act(routers)
+            except Exception as error:  # noqa: BLE001 - the others are stopped whatever happens to this one
+                return error
+
+        mesh = topology.is_mesh(self.endpoints)
+        places = [self.endpoints] if mesh else [[endpoint] for endpoint in self.endpoints]
+        with ThreadPoolExecutor(len(places)) as pool:
+            results = [asked.result() for asked in [pool.submit(attempt, routers) for routers in places]]
+        found = [result for result in results if not isinstance(result, Exception)]
+        self.seen = set().union(*(seen for seen, _ in found))
+        self.moving = self.seen - set().union(*(seen - moving for seen, moving in found))
+        errors = [result for result in results if isinstance(result, Exception)]
+        if errors and not found:
+            self.failure = errors[0]
+        elif errors:
+            pairs = zip(places, results, strict=True)
+            self.unreached = [topology.describe(routers) for routers, result in pairs if isinstance(result, Exception)]
 
     def _set_strangers_apart(self) -> None:
         """Set robots apart that are none of the run's: another run may have its router's address by now."""
@@ -228,15 +254,21 @@ class EmergencyStop:
         if report is not None:
             self.seen |= {*report.robots}
             down |= {*report.stopped}
-        if self.run is not None and self.expected and (self.failure is not None or not (self.seen or self.answered)):
+        doubt = self.failure is not None or (bool(self.unreached) and report is None)
+        if self.run is not None and self.expected and (doubt or not (self.seen or self.answered)):
             self.seen |= self.run.robots.keys()
         self.moving = self.seen - down
 
-    def _send(self, stop: messages.Stop, reported: Callable[[], set[str]]) -> None:
-        """Send it until no robot moves, by its own status or as `reported` by the process of the run."""
+    def _send(
+        self, routers: Sequence[str], stop: messages.Stop, reported: Callable[[], set[str]]
+    ) -> tuple[set[str], set[str]]:
+        """Send it until no robot moves, by its own status or as `reported` by the process of the run.
+
+        Returns the robots that are there, and those that move.
+        """
         keys = Keys(self.realm)
         # a robot that does not answer must not delay the others' stop
-        opened = network.open_session(self.endpoints, name="estop", wait_s=2.0, identity=self.identity, gather_s=0.0)
+        opened = network.open_session(routers, name="estop", wait_s=2.0, identity=self.identity, gather_s=0.0)
         with closing_cleanly(opened) as (session, declared):
             payload = messages.encode(stop)
             urgent = stop_publisher(session, keys)
@@ -244,26 +276,27 @@ class EmergencyStop:
             statuses = pubsub.pose_subscriber(session, keys.status("*"), 4096)
             inbox = pubsub.Inbox(statuses, messages.Status, keys=keys)
             declared += [urgent, statuses]
-            self.seen = alive(session, keys)
-            self.moving = set(self.seen)
+            seen = alive(session, keys)
+            moving = set(seen)
             begun = time.monotonic()  # begun after the question who is there, which may take as long
             watch = pubsub.AliveWatch(session, keys.alive("*"))
             while (now := time.monotonic()) < begun + STOP_ANSWER_S and (
-                self.moving - reported() or now < begun + LOOK_S or self._awaited(session, begun)
+                moving - reported() or now < begun + LOOK_S or self._awaited(session, begun)
             ):
                 urgent.put(payload)
                 time.sleep(STOP_AGAIN_S)
                 for token, stands in watch.changes():
                     robot = keys.robot_of(token)
-                    if robot is not None and stands and robot not in self.seen:
-                        self.seen.add(robot)
-                        self.moving.add(robot)
+                    if robot is not None and stands and robot not in seen:
+                        seen.add(robot)
+                        moving.add(robot)
                 for status in inbox.read():
-                    if status.robot not in self.seen and status.reason.startswith(messages.EMERGENCY):
-                        self.seen.add(status.robot)  # it has no token, because a hazard was landing it
-                        self.moving.add(status.robot)
+                    if status.robot not in seen and status.reason.startswith(messages.EMERGENCY):
+                        seen.add(status.robot)  # it has no token, because a hazard was landing it
+                        moving.add(status.robot)
                     if status.phase == STOPPED:
-                        self.moving.discard(status.robot)
+                        moving.discard(status.robot)
+        return seen, moving
 
     def _awaited(self, session: zenoh.Session, begun: float) -> bool:
         """Whether more members of a mesh may still be linked."""

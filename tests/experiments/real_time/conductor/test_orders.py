@@ -106,6 +106,26 @@ def test_stop_names_robots_without_a_token(phase, moving, monkeypatch):
     assert (stop.failure, stop.seen, stop.moving) == (None, {"B"}, moving)
 
 
+@pytest.mark.parametrize("of_run", [False, True], ids=["routers", "run"])
+def test_stop_goes_to_each_router(of_run, monkeypatch):
+    """Where the network is split, A and B are at one router, C is at another; a third one does not answer."""
+    places = [f"tcp/127.0.0.1:{port}" for port in (1, 2, 3)]
+    there = {places[0]: ({"A", "B"}, {"B"}), places[1]: ({"B", "C"}, {"C"})}
+
+    def by_network(_, routers, *__):
+        if routers[0] not in there:
+            raise Unreachable("no router answers")
+        return there[routers[0]]
+
+    monkeypatch.setattr(orders.EmergencyStop, "_send", by_network)
+    monkeypatch.setattr(run_registry, "tell", lambda *_: run_registry.StopReport(["A", "B", "C"], ["C"]))
+    run = changed(run_registry.own_entry("run", "three", places), robots=dict.fromkeys("ABC", "")) if of_run else None
+    stop = orders.EmergencyStop(places, "park", "operator", run)
+    stop.send("a test")
+    assert (stop.failure, stop.seen, stop.unreached) == (None, {"A", "B", "C"}, places[2:])
+    assert (stop.moving, stop.missed) == (set() if of_run else {"C"}, not of_run)
+
+
 @pytest.mark.parametrize(("phase", "ok"), [("landing", False), ("done", True)])
 def test_order_to_stop_waits_for_the_motors(phase, ok, monkeypatch):
     said = sent("park/A/status", changed(status("A", at=1.0), phase=phase))[0]
@@ -145,7 +165,7 @@ def stopped(monkeypatch):
         def by_network(*_):
             if isinstance(seen, Exception):
                 raise seen
-            stop.seen, stop.moving = set(seen), set(moving)
+            return set(seen), set(moving)
 
         monkeypatch.setattr(run_registry, "tell", lambda *_: report)
         monkeypatch.setattr(stop, "_send", by_network)
