@@ -206,6 +206,7 @@ class OwnershipCheck:
         self.awake_at = uptime()  # last run of the process [s]
         self.linked = True  # whether the session had a router, or a neighbour in a mesh, at the last look
         self._lost = False  # True if it had none, at any time since a look at which it was linked
+        self._away = False  # True from a standstill, or a return, until its check begins
         self._neighbours: set[str] = set()  # routers, or neighbours in a mesh, by their ids
         self._listener: zenoh.TransportEventsListener[None] | None = None
         self._watches: list[zenoh.Subscriber[None]] = []
@@ -223,6 +224,7 @@ class OwnershipCheck:
         if self._asking is None:
             self._asking = threading.Thread(target=self._ask, name="owner of the name", daemon=True)
             self._asking.start()
+        self._away = False  # not before: a process that was away does not object
 
     def finished(self) -> bool:
         """Whether no check runs (0.1 µs then); raises NameTaken, each time, if another process owns a name."""
@@ -234,16 +236,23 @@ class OwnershipCheck:
             raise NameTaken(self._taken)
         return self._asking is None
 
+    def note_run(self) -> None:
+        """Notes that the process runs now."""
+        self.awake_at = uptime()
+
     def check_standstill(self) -> bool:
         """Whether the process stood still since the last call for longer than its names are safe."""
-        last, self.awake_at = self.awake_at, uptime()
-        return self.awake_at - last >= self._stood_s
+        now = uptime()
+        stood = now - self.awake_at >= self._stood_s
+        self._away |= stood
+        self.awake_at = now
+        return stood
 
     def check_return(self, session: zenoh.Session) -> bool:
         """Whether the session is linked again after it was not: the names may be lost since.
 
-        A link that was cut for longer than the lease of this end is closed and opened again within milliseconds of its
-        return, thus between two looks.
+        A check has to begin then. A link that was cut for longer than the lease of this end is closed and opened again
+        within milliseconds of its return, thus between two looks.
         """
         if self._listener is None:
             callback = Callback(self._follow_links, indirect=False)
@@ -257,6 +266,7 @@ class OwnershipCheck:
             self.linked = network.connected(session)
             self._lost |= not self.linked
         if back := self._lost and self.linked:
+            self._away = True
             self._lost = False
         return back
 
@@ -280,7 +290,7 @@ class OwnershipCheck:
         while not self.finished() and not ended():
             waited = True
             time.sleep(TURN_S)
-            self.awake_at = uptime()
+            self.note_run()
         return waited
 
     def end(self) -> None:
@@ -308,7 +318,7 @@ class OwnershipCheck:
                 self._taken = key
             elif later and (self._asking is not None or uptime() - self.awake_at >= self._stood_s):
                 self._lost = True  # it was away
-            elif not self._lost:
+            elif not (self._lost or self._away):
                 self._object([Keys.objection(key, own_id, each) for each in later])
 
     def _object(self, objections: Sequence[str]) -> None:
@@ -353,7 +363,7 @@ class NameKeeper:
         alive = [self._keys.alive(name) for name in self._names]
         try:
             self._owned = claim(session, alive, began=self._began, endpoints=endpoints, stop=stop, timing=self._timing)
-            self.ownership.check_standstill()
+            self.ownership.note_run()
             self.ownership.check_return(session)
         except NameTaken as taken:
             raise NameTaken(

@@ -101,7 +101,7 @@ class Descent:
                 drives = ()
             self.watchdog.beat()
             time.sleep(self._ticks.period)
-        ownership.check_standstill()
+        ownership.note_run()
         self._keeper.hands_off = False
         over = self._ticks.elapsed()
         self.asked_at = self._ticks.zero + over

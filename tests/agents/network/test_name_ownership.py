@@ -429,8 +429,10 @@ def test_earlier_of_two_owners_stays(tokens, found):
     assert name_ownership.rivals(KEY, "f00d", tokens) == ([], False)
 
 
-@pytest.mark.parametrize(("began", "away"), [(2.0, False), (2.0, True), (0.5, False)])
-def test_owner_objects_to_a_later_one(began, away, monkeypatch):
+@pytest.mark.parametrize(
+    ("began", "away", "noticed"), [(2.0, False, False), (2.0, True, False), (2.0, True, True), (0.5, False, False)]
+)
+def test_owner_objects_to_a_later_one(began, away, noticed, monkeypatch):
     clock, net = ManualClock(), Net()
     monkeypatch.setattr(name_ownership, "uptime", clock.monotonic)
     with net.worn():
@@ -438,11 +440,12 @@ def test_owner_objects_to_a_later_one(began, away, monkeypatch):
         check = name_ownership.OwnershipCheck([KEY], network.ROBOT_LEASE_S)
         assert not check.check_return(net.session)
         clock.sleep(0.7 * away)
+        assert not noticed or check.check_standstill()
         for token in (*owner("f00d", 1.0), *owner("beef", began)):
             check._follow_tokens(Sample(token, "", b""))
         until(lambda: not any(thread.name == "objection" for thread in threading.enumerate()))
         assert (Keys.objection(KEY, "f00d", "beef") in net.tokens) == (began == 2.0 and not away)
-        assert check.check_return(net.session) == (began == 2.0 and away)
+        assert check.check_return(net.session) == (away and not noticed)
         assert check.finished()
         check._follow_tokens(Sample(Keys.objection(KEY, "beef", "f00d"), "", b""))
         if began == 0.5:
