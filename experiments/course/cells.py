@@ -97,8 +97,8 @@ def _live(descriptor: int) -> NoReturn:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         questions = Connection(descriptor)
         inmate = Inmate(*pickle.loads(questions.recv_bytes()))  # noqa: S301 - of the marking itself
-        copies = cache_folder() / "plugins" / inmate.choice.partition("@")[2]
-        wall_in(inmate.cpu_s, inmate.memory, [Path(copies)])
+        digest = inmate.choice.partition("@")[2]
+        wall_in(inmate.cpu_s, inmate.memory, [Path(cache_folder()) / "plugins" / digest] if digest else [])
         with supervised(CALL_S):
             _answer(questions, inmate)
     except EOFError:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from agents.errors import ExplainedError
+from agents.plugins.files import MAX_FILE_BYTES
 from experiments.file.document import inline
 from experiments.file.text import content, parsed
 
@@ -94,6 +95,12 @@ class Course:
     exercises: Mapping[str, Exercise]
     files: Mapping[str, str]
     solved: Mapping[str, str]
+    models: Mapping[str, bytes]  # learned models that stand in the folder, of solutions and others
+
+    @property
+    def given(self) -> Mapping[str, bytes]:
+        """Models that its exercises name, and groups get."""
+        return {name: model for name, model in self.models.items() if any(name in each for each in self.files.values())}
 
 
 def posed(text: str) -> str:
@@ -121,22 +128,32 @@ def read_course(folder: Path) -> Course:
         raise CourseError(
             f"{folder} {place}; name one of files with `# blank: ...` and `# end of blank` (docs/teaching.md)"
         )
-    return Course(exercises, files, solved)
+    return Course(exercises, files, solved, read_models(folder))
+
+
+def read_models(folder: Path) -> dict[str, bytes]:
+    """Learned models in a folder, by the names of their files; those that are too large are left out."""
+    found = {}
+    for file in sorted(folder.glob("*.onnx")):
+        if file.is_file() and file.stat().st_size <= MAX_FILE_BYTES:  # a pipe would be waited for
+            found[file.name] = file.read_bytes()
+    return found
 
 
 def write_exercises(course: Course, folder: Path) -> None:
     """Write the exercises into a folder, which is made; raises CourseError for one that has such files."""
-    if known := sorted(name for name in course.files if (folder / name).exists()):
+    texts, models = course.files, course.given
+    if known := sorted(name for name in (*texts, *models) if (folder / name).exists()):
         raise CourseError(f"{folder / known[0]} is there already; name another folder")
-    write(course.files, folder)
+    write({**texts, **models}, folder)
 
 
-def write(files: Mapping[str, str], folder: Path) -> None:
-    """Write texts by their names into a folder, which is made; raises CourseError if that cannot be done."""
+def write(files: Mapping[str, str | bytes], folder: Path) -> None:
+    """Write texts, or bytes, by their names into a folder, which is made; raises CourseError if that cannot be done."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name, text in files.items():
-            (folder / name).write_text(text, "utf-8")
+            (folder / name).write_bytes(text if isinstance(text, bytes) else text.encode("utf-8"))
     except OSError as error:
         raise CourseError(f"{error.filename}: cannot be written: {error.strerror}; name another folder") from None
 

@@ -28,8 +28,8 @@ import msgspec
 from agents.errors import ExplainedError
 from experiments.check.check import check
 from experiments.cores import cores
-from experiments.course.exercises import Course, CourseError, Exercise, write
-from experiments.course.stand_ins import company
+from experiments.course.exercises import Course, CourseError, Exercise, read_models, write
+from experiments.course.stand_ins import LEARNED, company
 from experiments.file.document import load
 from experiments.file.problems import DocumentError
 from experiments.file.text import content
@@ -77,6 +77,7 @@ class _Work(NamedTuple):
     group: str
     exercise: Exercise
     texts: Mapping[str, str]  # texts by the names of their files
+    models: Mapping[str, bytes]  # likewise, learned models
     fault: str = ""  # why they cannot be read
 
     def failed(self, *words: str) -> Mark:
@@ -114,7 +115,7 @@ def marks(
     names = Counter([SOLUTION, *(folder.resolve().name for folder in groups)])
     if twice := next((name for name, times in names.items() if times > 1), None):
         raise CourseError(f"two groups are named {twice}; give their folders other names")
-    works = [_Work(SOLUTION, each, course.solved) for each in exercises]
+    works = [_Work(SOLUTION, each, course.solved, course.models) for each in exercises]
     works += [_handed_in(each, folder.resolve()) for folder in groups for each in exercises]
     running: dict[int, _Process] = {}  # processes by their pipes
     with (
@@ -196,9 +197,10 @@ def _guard(pipe: int) -> NoReturn:
 def _handed_in(exercise: Exercise, folder: Path) -> _Work:
     names = [name for name in exercise.parts if (folder / name).is_file()]  # a pipe would be waited for
     try:
-        return _Work(folder.name, exercise, {name: content(folder / name, name) for name in names})
-    except DocumentError as error:
-        return _Work(folder.name, exercise, {}, str(error))
+        texts = {name: content(folder / name, name) for name in names}
+        return _Work(folder.name, exercise, texts, read_models(folder))
+    except (DocumentError, OSError) as error:
+        return _Work(folder.name, exercise, {}, {}, str(error))
 
 
 def _begun(work: _Work, task: Callable[[], Mark], folder: Path, limits: Allowance, guard: int) -> tuple[int, _Process]:
@@ -250,9 +252,11 @@ def _mark(course: Course, work: _Work, seeds: Sequence[int], folder: Path, limit
     solved, handed = folder / "course", folder / "group"
     try:
         write({**course.files, **{name: course.solved[name] for name in exercise.laws}}, solved)
+        write({**work.models, **course.given}, solved)
         write({name: texts.get(name, course.files[name]) for name in exercise.laws}, handed)
         changes = exercise.filled(texts[exercise.file], exercise.file) if exercise.file in texts else []
-        with company(exercise.classes, solved, handed, limits.cpu_s, limits.memory) as cells:
+        learned = any(LEARNED in each for each in (*changes, course.files[exercise.file]))
+        with company(exercise.classes, solved, handed, limits.cpu_s, limits.memory, learned=learned) as cells:
             read = load(solved / exercise.file, *changes)
             if errors := [str(each) for each in check(read) if each.severity == "error"]:
                 return work.failed(*(each.replace(f"{solved}/", "") for each in errors[:FEW]))

@@ -36,6 +36,7 @@ from experiments.cores import ONE_THREAD
 from experiments.course.cells import Inmate
 
 LONGEST: Final = 1 << 20  # longest answer [bytes]
+LEARNED: Final = "policy"  # name of the law and of the trigger that compute a model
 PASSED: Final = ("PATH", "PYTHONPATH", "LD_LIBRARY_PATH", "ZENPARK_CACHE_DIR")  # variables of the environment
 FAILED: Final = 1  # exit code where none is known
 ENDED: Final = -signal.SIGXCPU  # exit code of a process that had no computing time left
@@ -133,7 +134,9 @@ class Company:
 
 
 @contextmanager
-def company(choices: Sequence[str], solved: Path, handed: Path, cpu_s: int, memory: int) -> Iterator[Company]:
+def company(
+    choices: Sequence[str], solved: Path, handed: Path, cpu_s: int, memory: int, *, learned: bool = False
+) -> Iterator[Company]:
     """Puts stand-ins in the places of the classes of a course; they are gone with the block, as is the process.
 
     Args:
@@ -142,9 +145,11 @@ def company(choices: Sequence[str], solved: Path, handed: Path, cpu_s: int, memo
         handed: Folder of these files as the group has them.
         cpu_s: Computing time of a cell [s].
         memory: Memory of a cell [bytes].
+        learned: Also puts them in the places of the law and the trigger that compute a model in the ONNX format.
     """
     near, far = socket.socketpair()
     command = [sys.executable, "-P", "-m", "experiments.course.cells", str(far.fileno()), "numpy"]
+    command += ["onnxruntime"] * learned
     command += sorted({name for each in choices for name in _imports(handed / each.partition(":")[0])})
     kept = {name: os.environ[name] for name in PASSED if name in os.environ}
     environment = {**kept, **dict.fromkeys(ONE_THREAD, "1"), "PYTHONDONTWRITEBYTECODE": "1"}
@@ -157,6 +162,8 @@ def company(choices: Sequence[str], solved: Path, handed: Path, cpu_s: int, memo
         try:
             for choice in choices:
                 places.append(_stand_in(choice, solved, handed, made))
+            for group in (registry.LAWS, registry.TRIGGERS) if learned else ():
+                places.append(_replace(registry.load(group, LEARNED), LEARNED, made))
             yield made
         finally:
             for solution in places:
@@ -170,10 +177,14 @@ def _stand_in(choice: str, solved: Path, handed: Path, asked: Company) -> type:
     """Put a stand-in into the place of a class of the course, which is returned; raises PluginError."""
     adopted, _ = files.adopt(choice, solved)
     copy, _ = files.adopt(choice, handed)
-    solution: type = files.load(adopted)
+    return _replace(files.load(adopted), copy, asked)
+
+
+def _replace(solution: type, copy: str, asked: Company) -> type:
+    """The same of a class, which cells know as `copy`."""
     base = next((each for each in DECLARES if issubclass(solution, each)), None)
     if base is None:
-        raise PluginError(f"{choice} is neither a law nor a trigger: groups can write these alone")
+        raise PluginError(f"{solution.__name__} is neither a law nor a trigger: groups can write these alone")
     group = registry.LAWS if base is Law else registry.TRIGGERS
     content: dict[str, Any] = {"GROUP": group, "CHOICE": copy, "BASE": base, "COMPANY": asked}
     content |= {name: getattr(solution, name) for name in ("__module__", "__qualname__", "__doc__")}
@@ -215,7 +226,12 @@ def _fires(self: Any, view: TriggerView) -> bool:  # noqa: ANN401 - likewise
     return fired
 
 
-_LAW: Final = {"begin": _begin, "step": _step}
+def _analyse(self: Any, plan: Any) -> tuple[()]:  # noqa: ANN401 - likewise
+    """Nothing: the analysis of a law would compute here."""
+    return ()
+
+
+_LAW: Final = {"begin": _begin, "step": _step, "analyse": _analyse}
 _GRADIENT: Final = {"pull": _pull}
 _TRIGGER: Final = {"fires": _fires}
 

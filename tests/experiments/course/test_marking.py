@@ -10,11 +10,13 @@ import numpy as np
 import psutil
 import pytest
 
+from agents.plugins.extras import policy
 from experiments.course.exercises import OURS, CourseError, posed, read_course, write, write_exercises
 from experiments.course.stand_ins import company
 from experiments.course.wall import lacking
 from experiments.file.document import load
 from experiments.run import simulate
+from tests.agents.learned import learned_bytes
 from tests.commands import GUARD, environment, invoke, python, started, zenpark
 from tests.waiting import until
 
@@ -331,6 +333,35 @@ def test_a_gradient_tells_other_robots_nothing(tmp_path):
             assert len(cells.processes) >= 3
     one, other = (next(iter(each.traces.values())) for each in flown.values())
     assert np.array_equal(one.true_position, other.true_position)
+
+
+@walled
+def test_learned_policies_are_marked_within_the_wall(tmp_path, monkeypatch):
+    """A group hands in an ONNX file, which no process of the course computes."""
+    pytest.importorskip("onnxruntime", reason="policies are the extra [policy]: ./zenpark install onnxruntime")
+
+    def model(gain):
+        return learned_bytes(2, 2, weights=((gain, 0.0), (0.0, gain)), observes="", observes_each="place")
+
+    blank = '{ kind = "policy", file = "solution.onnx" }\n'
+    text = FILE.replace('law = "meet.py:Meet"\n', f"# blank: # law = a policy\nlaw = {blank}# end of blank\n")
+    course, unfit = tmp_path / "course", learned_bytes(2, 3)
+    write({"meet.toml": text, "places.py": METRIC, "solution.onnx": model(0.2)}, course)
+    models = {"right": model(0.2), "flees": model(-0.2), "broken": b"?", "unfit": unfit, "steals": None}
+    for name, given in models.items():
+        file = "solution.onnx" if given is None else "other.onnx"
+        handed = {"meet.toml": text.replace("solution.onnx", file)} | ({} if given is None else {file: given})
+        write(handed, tmp_path / name)
+    found, _ = marked(course, *(tmp_path / name for name in models), code=1)
+    assert {name for name, mark in found.items() if mark["met"] == mark["of"]} == {"(solution)", "right"}
+    assert "drives the robots apart" in found["flees"]["words"][0]
+    assert "output of 2 numbers; this gives 3" in found["unfit"]["words"][0]
+    assert "cannot use its file" in found["broken"]["words"][0]
+    assert "solution.onnx cannot be read" in found["steals"]["words"][0]
+    with company([], course, course, 20, 1 << 30, learned=True) as cells:
+        monkeypatch.setattr(policy, "load", None)  # none of this process
+        assert simulate(load(course / "meet.toml"), seed=3).metrics["default"]
+        assert len(cells.processes) >= 3
 
 
 @pytest.mark.slow
