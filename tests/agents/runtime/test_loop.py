@@ -46,7 +46,7 @@ def net():
 
 
 @pytest.fixture
-def on_stage(monkeypatch, net):
+def on_stage(net, monkeypatch):  # in this order, or what is patched inside would be the network of later tests
     return partial(Stage, monkeypatch, net)
 
 
