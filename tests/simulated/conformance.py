@@ -50,7 +50,10 @@ class Event(NamedTuple):
 
 @dataclass(frozen=True)
 class Script:
-    """Steps (time [s], who, what, arguments) of clients, cables (`cut`, `mend`) and processes."""
+    """Steps (time [s], who, what, arguments) of clients, cables (`cut`, `mend`) and processes.
+
+    The cable of a client is its own, that of a router leads to the routers before it.
+    """
 
     guess: str
     steps: Sequence[tuple[Any, ...]]
@@ -242,7 +245,13 @@ def simulate(script: Script, seed: int = 1) -> list[Event]:
 
         def step(who: str, what: str, *arguments: object) -> None:
             process = processes[who]
-            if what in ("cut", "mend"):
+            if what in ("cut", "mend") and who.startswith("router"):
+                beyond = {
+                    who,
+                    *(each.process.name for each in net.sessions if each.link and each.link.far.process is process),
+                }
+                net.split(beyond.__contains__ if what == "cut" else None)
+            elif what in ("cut", "mend"):
                 for session in process.sessions:
                     net.cut(session, what == "cut")
             elif what in ("freeze", "thaw", "kill"):
@@ -308,17 +317,20 @@ class RealStage:
     def _start(self, who: str) -> None:
         if who.startswith("router"):
             row = int(who.removeprefix("router") or 1) - 1
-            link = [word for place in self._places[:row] for word in ("--connect", place)]
+            link = [word for place in self._reached(who, self._places[:row]) for word in ("--connect", place)]
             self._spawn(who, "agents.runtime.router", "--listen", self._places[row], *link)
             return
-        places = self._places
-        if who in self._script.cables:
-            near = [free_endpoint(preferred_port=0) for _ in places]
-            ports = [place.rpartition(":")[2] for pair in zip(near, places, strict=True) for place in pair]
-            self._spawn(f"cable {who}", "tests.simulated.cable", *ports)
-            places = near
         lease_s = self._script.leases.get(who, 2.0)
-        self._spawn(who, "tests.simulated.conformance", str(lease_s), *places)
+        self._spawn(who, "tests.simulated.conformance", str(lease_s), *self._reached(who, self._places))
+
+    def _reached(self, who: str, places: Sequence[str]) -> Sequence[str]:
+        """Endpoints by which a process reaches routers: through its cable, if it has one."""
+        if who not in self._script.cables:
+            return places
+        near = [free_endpoint(preferred_port=0) for _ in places]
+        ports = [place.rpartition(":")[2] for pair in zip(near, places, strict=True) for place in pair]
+        self._spawn(f"cable {who}", "tests.simulated.cable", *ports)
+        return near
 
     def _spawn(self, who: str, module: str, *arguments: str) -> None:
         command = [sys.executable, "-m", module, *arguments]

@@ -218,4 +218,24 @@ SCRIPTS: Final[dict[str, Script]] = {
         8.0,
         routers=2,
     ),
+    "the cable of two routers is cut": Script(
+        "both sides lose the token of the other after 2 s; it is back with the last value as soon as the cable is",
+        [
+            (0.0, "b", "open", 1), (0.1, "b", "watch", "t/*"), (0.2, "b", "subscribe_advanced", "v/*", 1),
+            *JOINED[3:], (0.7, "b", "token", "t/b"), (0.8, "a", "watch", "t/*"), (1.2, "router2", "cut"),
+            (1.8, "a", "put", "v/a", "2"), (2.0, "b", "ask_tokens", "t/*", 9.0), (5.6, "router2", "mend"),
+            (7.0, "a", "put", "v/a", "3"),
+        ],
+        8.0,
+        routers=2,
+    ),
+    "the cable of two routers is cut shortly": Script(
+        "no token changes; the value that was put meanwhile arrives when the cable is back",
+        [
+            (0.0, "b", "open", 1), (0.1, "b", "watch", "t/*"), (0.2, "b", "subscribe_advanced", "v/*", 1),
+            *JOINED[3:], (1.2, "router2", "cut"), (1.5, "a", "put", "v/a", "2"), (2.2, "router2", "mend"),
+        ],
+        3.5,
+        routers=2,
+    ),
 }  # fmt: skip
