@@ -35,7 +35,7 @@ from twins.engines.engine import Touch
 TICK_S: Final = 15e-6  # [s] CPU time of a tick of a robot in plain Python: 10 to 20 µs
 AVOIDING_S: Final = 100e-6  # [s] likewise, with an avoidance that looks at many
 PAYS_S: Final = 0.3  # [s] work below which plain Python is quicker than to translate and compile
-OFTEN_S: Final = 20.0  # [s] following work for which a second of `cc` pays
+OFTEN_S: Final = 15.0  # [s] following work for which a second of `cc` pays, about; its program is kept
 LONGEST: Final = 10_000  # ticks of a stretch
 ROBOT_TICKS: Final = 1_000_000  # ticks of all its robots: noise is drawn, and room kept, for all of them beforehand
 LEAST: Final = 20  # ticks below which a stretch is followed by a pause
