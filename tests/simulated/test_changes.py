@@ -96,3 +96,15 @@ def test_spare_takes_over_name_of_frozen_robot():
     assert 0.8 + 3.0 < former.ended < 0.8 + 1.0 + 3.2, "no answer, then 3 s of silence"
     assert [phase.reason for phase in robot.phases if phase.pid == second.pid][-1] == "finished"
     assert misses(flight) == {"D"}, "which is on standby"
+
+
+@pytest.mark.parametrize("words", ["replace --body twin", "restart"])
+def test_robot_stopped_while_it_leaves_stays_down(words):
+    """Seed 160378: its next process took off two seconds after the stop."""
+    flight = fly(DRONE, order(0.06, words, "C"), order(0.6, "stop", "C"), settings=["duration_s=5"])
+    change, stop = flight.answers
+    assert (stop.code, change.code) == (0, 1)
+    assert "was ordered to stop meanwhile" in change.output
+    assert flight.robots["C"].motors[-1][1] is False
+    assert flight.robots["C"].motors[-1][0] < 0.7
+    assert (flight.code, flight.violations) == (1, [])

@@ -301,6 +301,9 @@ class Conductor(CaseRun):
                 self._landed.setdefault((view.status.reason, f"after {after_s:.1f} of {duration_s:g} s"), []).append(
                     name
                 )
+        for name, at in self._changes.stopped.items():
+            if name not in known:
+                self._landed.setdefault((STOP, f"after {at - start:.1f} of {duration_s:g} s"), []).append(name)
 
     def _landings(self) -> list[str]:
         """Sentences about the robots of `_note_landings`."""

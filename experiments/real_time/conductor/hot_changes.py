@@ -72,6 +72,7 @@ class HotChanges:
         self._leaving: set[str] = set()
         self._ended: dict[str, str] = {}  # robots with a process that ended while they joined, and its end
         self._losses: dict[str, int] = {}
+        self.stopped: dict[str, float] = {}  # robots that an operator stopped while they left, and when [s, UTC]
         self._spares = Spares(plan)
 
     @property
@@ -216,9 +217,17 @@ class HotChanges:
         yield from self._leave(names)
         return "removed: it is down, and the others go on"
 
-    def _leave(self, names: Sequence[str]) -> Generator[None]:
-        """Robots land and leave the network; their process ends if no other robot needs it."""
-        processes = self._processes
+    def _stopped(self, names: Sequence[str]) -> set[str]:
+        """Robots that an operator has stopped."""
+        statuses = [(name, self._robots[name].status) for name in names]
+        return {name for name, status in statuses if status is not None and status.reason.startswith(STOP)}
+
+    def _leave(self, names: Sequence[str], *, returns: bool = False) -> Generator[None]:
+        """Robots land and leave the network; their process ends if no other robot needs it.
+
+        A robot that `returns` does not do so if an operator stops it meanwhile.
+        """
+        processes, before = self._processes, self._stopped(names)
         present = [name for name in names if self._robots[name].alive or processes.runs(name)]
         together = processes.companions(names[0])
         staying = [other for other in together if other not in names and not self._robots[other].gone]
@@ -248,10 +257,14 @@ class HotChanges:
             yield
         for name in present:
             self._view.report("left", name, "it is down, and has left the run")
+        stopped = sorted(self._stopped(names) - before)
+        self.stopped |= dict.fromkeys(stopped, self._view.clock.utc())
         for name in names:
             self._robots[name].left_because = "removed"
             self._robots[name].forget_process()
         self._leaving -= {*names}  # the next end of a process is that of another one
+        if returns and stopped:
+            raise Refusal(f"{', '.join(stopped)} was ordered to stop meanwhile: restart it when the arena is free")
 
     def _frozen(self, name: str) -> bool:
         view = self._robots[name]
@@ -281,7 +294,7 @@ class HotChanges:
             )
         places = {name: processes.place(name) for name in names if processes.robot(name).body == TWIN}
         yield from self._room(places, ROOM_S if order.operator == "on_loss" else 0.0)
-        yield from self._leave(names)
+        yield from self._leave(names, returns=True)
         processes.start_again(names)
         yield from self._join(names)
         return f"takes part again after {time.monotonic() - asked:.1f} s"
@@ -295,7 +308,7 @@ class HotChanges:
         if next_one.body == TWIN:
             places = {name: self._processes.place(name, next_one)}
             yield from self._room(places, ROOM_S if order.operator == "on_loss" else 0.0, body_stays=True)
-        yield from self._leave(names)
+        yield from self._leave(names, returns=True)
         self._processes.start_again(names, {name: next_one})
         if spare is not None:
             self._spares.used[spare] = name
