@@ -52,7 +52,7 @@ def by_hand(trace: Trace) -> tuple[float, float]:
     rates, errors = [], []
     for row in range(len(trace.robots)):
         if row in net.receiver:  # the leader is not: it receives nothing
-            rates.append(len(trace.sent_by(row)) / duration)
+            rates.append(len(trace.sent_at[row]) / duration)
             error = off[:, net.receiver == row].sum(axis=1)
             errors.append(np.trapezoid(error, trace.time))
     assert len(rates) == 6
@@ -87,7 +87,7 @@ ASKED_S = 0.02  # `pose_hz` is 50
 
 def waits(trace: Trace, robot: str) -> Array:
     """Times between the messages of a robot [s]."""
-    return np.diff(trace.sent_by(trace.robots.index(robot)).stamp)
+    return np.diff(trace.sent_at[trace.robots.index(robot)])
 
 
 event = run.traces["event"]
@@ -165,7 +165,7 @@ assert 0.8 < within[~ground].min() < within[~ground].max() < 0.9
 
 # %%
 predictive = run.traces["predictive"]
-spoken = {name: len(trace.sent_by(trace.robots.index("TB01"))) for name, trace in run.traces.items()}
+spoken = {name: len(trace.sent_at[trace.robots.index("TB01")]) for name, trace in run.traces.items()}
 print(f"messages of the leader: {spoken}")
 assert spoken["periodic"] == 2250  # 50 Hz for 45 s
 assert spoken["predictive"] < spoken["event"] / 4
