@@ -41,6 +41,7 @@ TROUBLES: Final = ("late", "unread")  # kinds of events of the run itself, not o
 PRESENT: Final = 0.8  # least share of known positions of a robot: below it the robot was out of reach
 GAP_S: Final = 0.5  # [s] shorter times without a position are not named
 HELD: Final = 0.2  # share of the time for which a robot may be held
+LAST_S: Final = 0.5  # longest time between the last sample of a whole recording and the order to land [s]
 NAMED_S: Final = 0.05  # [s] shorter holds are not named
 # causes of holds that are not part of an experiment
 HOLDING: Final = (Cause.ORDERED, Cause.POSITION, Cause.ROUTER, Cause.CENTRE, Cause.SUSPENDED)
@@ -179,9 +180,12 @@ def failures(trace: Trace, known: Sequence[float]) -> tuple[str, ...]:
     for name, share in zip(trace.robots, known, strict=True):
         if share < PRESENT and name not in taken_out:
             found.setdefault(name, f"{name}: its position was known for {share:.0%} of the time only")
-    if ended_early(trace) and not _landed_by_conductor(trace):
+    last, silent = _last_sample(trace), found.keys() >= {*trace.robots}
+    if (ended_early(trace) or (last < trace.time[-1] - LAST_S and not silent)) and not _landed_by_conductor(
+        trace, last
+    ):
         planned = trace.plan.experiment.duration_s
-        found[""] = f"the recording breaks off after {trace.time[-1]:.1f} s of {planned:g} s"
+        found[""] = f"the recording breaks off after {last:.1f} s of {planned:g} s"
     return tuple(found.values())
 
 
@@ -190,10 +194,16 @@ def _moment(event: Event) -> str:
     return f"at {abs(event.stamp):.1f} s" if event.stamp > -0.05 else f"{-event.stamp:.1f} s before the start"
 
 
-def _landed_by_conductor(trace: Trace) -> bool:
-    """Whether the recording has the end of the run: the conductor's order to land, also of an interrupted run."""
+def _last_sample(trace: Trace) -> float:
+    """Time of the last sample of any robot [s]."""
+    known = np.isfinite(trace.position).any(axis=(1, 2))
+    return float(trace.time[known][-1] if known.any() else trace.time[-1])
+
+
+def _landed_by_conductor(trace: Trace, last: float) -> bool:
+    """Whether the recording has samples until the conductor's order to land, also of an interrupted run."""
     phases = (event for event in trace.events if (event.kind, event.source) == ("phase", "conductor"))
-    return any(event.text.startswith("landing") for event in phases)
+    return any(event.text.startswith("landing") and event.stamp <= last + LAST_S for event in phases)
 
 
 def _taken_out(trace: Trace) -> dict[str, str]:

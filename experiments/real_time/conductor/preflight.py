@@ -181,11 +181,11 @@ class Inspector(CaseRun):
         for check, option, wanted, judge in trials:
             why = "" if wanted else f"--{option} tries it"
             if wanted and (red or self._context.ended()):
-                why = f"not tried: {'interrupted' if self._context.ended() else 'mend that first'}"
+                why = f"not tried: {self._end or 'mend that first'}"
             if not why:
                 self._phase(f"{name}: {check}")
                 made = judge()
-                why = f"interrupted; {self._at_end(name)}" if self._context.ended() else ""
+                why = f"{self._end}; {self._at_end(name)}" if self._end else ""
                 red = made.verdict == "bad"
             yield Check(check, "unknown", why) if why else made
 
@@ -225,8 +225,8 @@ class Inspector(CaseRun):
         reply = self._order(name, messages.Order("takeoff"))
         if reply.ok and robot.hover is None:
             self._wait(TRY_S, lambda: self._robots[name].reached("airborne"))
-            if self._context.ended():
-                return "interrupted"
+            if self._end:
+                return self._end
             reply = self._order(name, messages.Order("start", at=self._clock.utc() + start_lead_s(1)))
         return "" if reply.ok else f"refused: {reply.reason}"
 
@@ -324,6 +324,11 @@ class Inspector(CaseRun):
 
     def _order(self, name: str, order: messages.Order) -> messages.Reply:
         return self._view.order([name], order)[name]
+
+    @property
+    def _end(self) -> str:
+        """What has ended the checks; empty while they go on."""
+        return "" if not self._context.ended() else "emergency stop" if self._context.emergency else "interrupted"
 
     def _at_end(self, name: str) -> str:
         """Last report of a robot that was moved about its motors."""

@@ -275,7 +275,7 @@ class Trying(Inspector):
     def __init__(self, at):
         self._experiment, self._trials, self._clock = document.read("triangle").experiment, Trials(hop=True), Clock()
         self._robots, self._ended, self._states = {"KH01": RobotView()}, {}, {}
-        self._context = SimpleNamespace(ended=lambda: self._robots["KH01"].phase == at)
+        self._context = SimpleNamespace(ended=lambda: self._robots["KH01"].phase == at, emergency=None)
         self._processes = SimpleNamespace(adopted=(), start=lambda *_: None, end_robots=lambda: None)
         self._view = SimpleNamespace(order=self._obey)
         self.given = []
