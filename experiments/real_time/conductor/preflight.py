@@ -327,7 +327,7 @@ class Inspector(CaseRun):
 
     @property
     def _end(self) -> str:
-        """What has ended the checks; empty while they go on."""
+        """Words for the end of the checks; empty while they go on."""
         return "" if not self._context.ended() else "emergency stop" if self._context.emergency else "interrupted"
 
     def _at_end(self, name: str) -> str:
