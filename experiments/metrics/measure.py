@@ -180,10 +180,9 @@ def failures(trace: Trace, known: Sequence[float]) -> tuple[str, ...]:
     for name, share in zip(trace.robots, known, strict=True):
         if share < PRESENT and name not in taken_out:
             found.setdefault(name, f"{name}: its position was known for {share:.0%} of the time only")
-    last, silent = _last_sample(trace), found.keys() >= {*trace.robots}
-    if (ended_early(trace) or (last < trace.time[-1] - LAST_S and not silent)) and not _landed_by_conductor(
-        trace, last
-    ):
+    last = _last_sample(trace)
+    unrecorded = last < trace.time[-1] - LAST_S and not found.keys() >= {*trace.robots}
+    if (ended_early(trace) or unrecorded) and not _landed_by_conductor(trace, last):
         planned = trace.plan.experiment.duration_s
         found[""] = f"the recording breaks off after {last:.1f} s of {planned:g} s"
     return tuple(found.values())

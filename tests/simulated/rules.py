@@ -13,6 +13,7 @@ from math import hypot, inf, isfinite
 from pathlib import Path
 
 from agents.decision.lifecycle import AIRBORNE, DONE, LANDING, RUNNING, Phase
+from agents.runtime.lifeline import GONE
 from tests.simulated.end_rules import ASKED, End
 from tests.simulated.kernel import Process
 from tests.simulated.look import AT_THE_END, OF_COMMANDS, OF_PAIRS, OF_POSES, OF_ROBOTS, Look, Rule, Seen, rule
@@ -234,6 +235,7 @@ def picture_of_the_conductor(look: Look, seen: Seen) -> str:
     if view is None or view.status is None or conductor.dead:
         return ""
     well = look.calm and look.linked(conductor) and look.linked(seen.process) and seen.governed
+    well = well and seen.reason != GONE  # a conductor that ends its robots looks no more
     wrong = well and not seen.inside._descent.begun and view.status.phase != Phase(seen.phase).word
     lasted = look.lasting(("view", seen.name), wrong, 3.0)
     return f"is {Phase(seen.phase).word}, the conductor says {view.status.phase} for {lasted:.1f} s" if lasted else ""

@@ -184,7 +184,7 @@ MUTANTS = {
         test_hosts.test_frozen_launcher_lands_all_and_gives_no_order,
     ),
     "broken recording is no matter": (
-        MEASURE, "if ended_early(trace) and not", "if False and not", run("recorder_hangs_to_the_end"),
+        MEASURE, "if (ended_early(trace) or unrecorded) and not", "if False and not", run("recorder_hangs_to_the_end"),
     ),
     "wrong distances of robots": (
         "experiments/metrics/signals.py", "norm(position[:, i + 1 :] - position[:, i, None])",

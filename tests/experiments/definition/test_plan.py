@@ -8,7 +8,7 @@ import msgspec
 import networkx as nx
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from agents.body.interface import BodyError, BodyState, Disturbance, Jitter
@@ -142,27 +142,30 @@ def test_frameworks_that_bend_to_first_order(position, pairs, rank, low, high):
 
 
 def one_by_one(position, pairs, free):
-    """Whether the rest is rigid without each link, and without each robot."""
-    without_link = [rigidity(position, np.delete(pairs, k, axis=0), free).rigid for k in range(len(pairs))]
+    """Rigidity of the rest without each link, and without each robot."""
+    without_link = [rigidity(position, np.delete(pairs, k, axis=0), free) for k in range(len(pairs))]
     without_robot = []
     for row in range(len(position)):
         rest = pairs[(pairs != row).all(axis=1)]
         left = rigidity(np.delete(position, row, axis=0), rest - (rest > row), np.delete(free, row, axis=0))
-        without_robot.append(left.rigid)
+        without_robot.append(left)
     return without_link, without_robot
 
 
 @examples(60)
 @given(st.integers(0, 2**32 - 1), st.integers(3, 9), st.sampled_from([0.5, 0.7, 0.9]), st.booleans())
 def test_redundancy_is_that_of_leaving_each_out(seed, rows, share, in_space):
+    """Where a singular value is near the limit of zeros the two ways may differ."""
     rng = np.random.default_rng(seed)
     position = rng.uniform(-1.0, 1.0, (rows, 3))
     free = np.ones((rows, 3), dtype=bool) if in_space else held_heights(rows)
     every = np.stack(np.triu_indices(rows, 1), axis=1)
     pairs = every[rng.random(len(every)) < share].reshape(-1, 2)
     found = redundancy(position, pairs, free)
-    rigid = rigidity(position, pairs, free).rigid
-    wanted = one_by_one(position, pairs, free) if rigid else ([False] * len(pairs), [False] * rows)
+    parts = one_by_one(position, pairs, free)
+    assume(not any(1e-7 < left.smallest < 1e-3 for part in parts for left in part))
+    whole = rigidity(position, pairs, free).rigid
+    wanted = tuple([whole and left.rigid for left in part] for part in parts)
     assert (found.pairs.tolist(), found.robots.tolist()) == wanted
 
 
