@@ -38,7 +38,7 @@ FIRST = np.array([0.0, 1.5, 3.0, 0.2, 0.0, 0.0, 0.0, 0.0])
 # logarithm of a threshold [m], weight of the time since the last event [cm/s], and of the error [1/100]
 FIRST_TRIGGER = np.array([-4.0, 0.0, 0.0])
 SPREAD = 0.2  # first deviation of these numbers
-GENERATIONS, CANDIDATES = 32, 12  # of a policy; a trigger has half of these generations
+GENERATIONS, CANDIDATES = 32, 12  # numbers for a policy; a trigger has half the generations
 STARTS = 8  # seeds that it flies in turn
 REST = 80.0  # weight of the mean error over the last ten decisions: they count nine times
 PRICE = 0.05  # error of a robot over one decision that is worth a message [m]

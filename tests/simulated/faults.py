@@ -226,7 +226,7 @@ WEIGHTS = {
     "corrupt": 1,
 }  # fmt: skip
 SINCE = {"start": 8, "launch": 2, "ready": 1, "landing": 1}  # how often a fault counts from a moment
-BEYOND = {"second": 0.6, "operator": 0.3, "conductor": 0.15, "recorder": 0.15, "world": 0.2}  # of a split: how often
+BEYOND = {"second": 0.6, "operator": 0.3, "conductor": 0.15, "recorder": 0.15, "world": 0.2}  # shares beyond a split
 BUSY_S = {"launch": 3.0, "ready": 2.0, "landing": 2.0}  # time after it in which much happens
 OF_ANY = ("pause", "kill", "term", "cut", "loss", "slow", "late", "step")  # kinds that may hit any process
 COUNTS = (1, 2, 3, 5, 8, 12)

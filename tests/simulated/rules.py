@@ -155,7 +155,7 @@ def obedience(look: Look, seen: Seen) -> str:
         age = look.now - look.world.ends.get(process.pid, inf)
         word = words.split()[1] if words.startswith("robot ") else ""
         newest = not any(
-            look.now >= t > look.now - age - 1.0 and other in {who, ""}  # to all
+            look.now >= t > look.now - age - 1.0 and other in {who, ""}  # "" is an order to all
             for t, other, _, each in look.world.answers
             if each is not process
         )

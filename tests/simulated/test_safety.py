@@ -210,7 +210,7 @@ def test_former_owner_commands_nothing(back, end, more):
 
 
 def test_router_is_lost_after_its_last_words():
-    """What it sent before came up to 2 s later over a slow link, and the rule did not wait for that (seed 150012)."""
+    """A suspended router's messages came up to 2 s later over a slow link, and the rule did not wait (seed 150012)."""
     slow, silent = Fault(0.5, "slow", "A", 1500, 9.0), Fault(1.5, "pause", "router", lasts=6.0)
     assert fly(TRIO, slow, silent, settings=["duration_s=5"]).violations == []
 

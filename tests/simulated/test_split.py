@@ -11,7 +11,7 @@ from tests.simulated.small import DRONE, TICK_S, TRIO
 
 SOON_S = 2.5 * TICK_S
 MEET_S = 0.15  # time from the end of a split until its routers are linked, and tokens have passed
-FIRST = Fault(0.505, "split", "router2 B C", lasts=4.0)  # after it B and C stay at the router of their side
+FIRST = Fault(0.505, "split", "router2 B C", lasts=4.0)  # B and C stay at the router of their side
 
 
 def split(*faults, experiment=TRIO, **more):
@@ -113,7 +113,7 @@ def test_of_two_owners_the_later_one_ends(name):
 
 @pytest.mark.parametrize(("at", "lasts"), [(3.0, 3.0), (5.0, 0.9)], ids=["long", "shorter than its lease"])
 def test_owner_that_was_away_does_not_object(at, lasts):
-    """It is suspended while the network heals: the other one has the name since."""
+    """The owner is suspended while the network heals: the other process has the name since."""
     parts, away = Fault(0.5, "split", "router2 second", lasts=5.0), Fault(at, "pause", "A", lasts=lasts)
     flight = split(parts, Fault(1.0, "twice", "A"), away, settings=["duration_s=11"])
     first, (second,) = flight.of("default-A")[0], flight.of("second A")

@@ -51,7 +51,7 @@ def test_starts_where_the_robot_is_within_its_speed(plan, anchor, heading, begin
     start, *path = places(planner, [0.0, *(begin + dt * k for k in range(60))], anchor, heading)
     assert start == pytest.approx(anchor, abs=1e-12)
     assert max(map(dist, path, path[1:])) <= planner.speed() * dt + 1e-9
-    if plan["kind"] in ("line", "circle"):  # and no larger than needed
+    if plan["kind"] in ("line", "circle"):  # the bound is as small as can be
         first, second = places(planner, (0.0, 1e-4), (0.3, -0.2, 0.1), 0.7)
         assert dist(first, second) / 1e-4 == pytest.approx(planner.speed(), rel=1e-6)
 

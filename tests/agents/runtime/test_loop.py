@@ -46,7 +46,7 @@ def net():
 
 
 @pytest.fixture
-def on_stage(net, monkeypatch):  # in this order, or what is patched inside would be the network of later tests
+def on_stage(net, monkeypatch):  # the order matters: else the patch would stay for later tests
     return partial(Stage, monkeypatch, net)
 
 

@@ -321,7 +321,7 @@ def test_stand_ins_fly_as_the_law_itself(tmp_path):
 
 
 def test_a_gradient_tells_other_robots_nothing(tmp_path):
-    """What one call leaves in a module, no other link of the group's law finds: each has a process of its own."""
+    """Each link of a group's law has a process of its own: it finds nothing that another one left in a module."""
     told = PULL.replace("class Pull", "sides = set()\n\nclass Pull")
     told = told.replace("far = ", "sides.add(apart[0] > 0.0); far = len(sides) * ")
     flown = {}
