@@ -82,6 +82,7 @@ class Commands:
         # session that owns the name of a robot: a new one restarts the numbers of its commands
         self.lives: dict[str, str] = {}
         self._owners = pubsub.AliveWatch(session, Keys.life(keys.alive("*"), "*"))
+        self._stopped = set[str]()  # robots that stay stopped, whatever a process says that missed the stop
         self._strangers: set[str] = set()
         self.quiet = [inf] * len(names)  # begin of the silence of each robot; infinity: it needs no command
         self.restart()
@@ -107,11 +108,16 @@ class Commands:
             row = self._row[str(sample.key_expr)]
             if command.seq > self.done.get(command.robot, 0):
                 self.done[command.robot] = command.seq
-                self._obey(row, command, t)
+                if command.robot not in self._stopped:
+                    self._obey(row, command, t)
 
     def stop(self) -> None:
-        """Switches all motors off and halts all wheels, as an emergency stop demands of the robots themselves, too."""
+        """Switches all motors off and halts all wheels, as an emergency stop demands of the robots themselves, too.
+
+        A robot moves again once another process owns its name.
+        """
         rows = [*self._row.values()]
+        self._stopped.update(self._population.names[row] for row in rows)
         for row in rows:
             self._given[row], self._held[row] = NO_SETPOINT, False
             self.quiet[row] = inf
@@ -169,6 +175,8 @@ class Commands:
             return
         if self.lives.get(name, life) != life:
             self.done.pop(name, None)
+        if self.lives.get(name) != life:
+            self._stopped.discard(name)
         self.lives[name] = life
 
     def _known(self, key: str) -> bool:

@@ -288,6 +288,30 @@ def test_world_obeys_sender_with_clock_behind():
         assert order(BEHIND, "stop")
 
 
+def test_stopped_world_robot_obeys_new_processes_alone():
+    """A process that missed the emergency stop took off again, or drove on."""
+    with Net().worn() as net:
+        bodies = WorldBodies(Plan(pair(robots={"F": DRONE}, formation=Formation())))
+        process = joined_world(net, bodies)
+
+        def flies_after(seq):
+            net.deliver(sent(KEYS.setpoint("F"), messages.Command("F", seq, UTC, "takeoff", height=0.5))[0])
+            process._tick(0.1 * seq)
+            return bodies.body.engine.motions[0].flying
+
+        process._stopped.set()  # before its process is there
+        process._tick(0.0)
+        own(net, KEYS.alive("F"), "one")
+        assert flies_after(1)
+        process._stopped.set()
+        assert [flies_after(2), flies_after(3)] == [False, False]
+        assert process.commands.done == {"F": 3}, "it is answered"
+        own(net, KEYS.alive("F"), "one")
+        assert not flies_after(4), "it was cut off, and is the same"
+        own(net, KEYS.alive("F"), "two")
+        assert flies_after(5)
+
+
 def test_world_of_many_robots_knows_name_owners():
     names = [f"F{row:03}" for row in range(120)]  # each with a token, a claim and the token of an owner
     with Net().worn() as net:
