@@ -1,4 +1,4 @@
-"""The README's experiment, its law and its error are what `check` says of them."""
+"""The README's experiment, its law, its trigger and its error are what `check` says of them."""
 
 import re
 
@@ -11,15 +11,19 @@ from tests.commands import ROOT
 
 TEXT = (ROOT / "README.md").read_text("utf-8")
 (FILE,) = re.findall(r"^```toml\n(.*?)^```", TEXT, re.DOTALL | re.MULTILINE)
-(LAW,) = re.findall(r"^```python\n(.*?)^```", TEXT, re.DOTALL | re.MULTILINE)
+(OWN,) = re.findall(r"^```python\n(.*?)^```", TEXT, re.DOTALL | re.MULTILINE)
 
 
-@pytest.mark.parametrize("law", ["", 'law = "my_laws.py:Spring"'])
-def test_example_has_no_finding(law, tmp_path):
-    (tmp_path / "my_laws.py").write_text(LAW, encoding="utf-8")
+SETTINGS = re.findall(r"--set (\S*mine\.py:\S*)", TEXT)
+
+
+@pytest.mark.parametrize("settings", [[], SETTINGS])
+def test_example_has_no_finding(settings, tmp_path):
+    (tmp_path / "mine.py").write_text(OWN, encoding="utf-8")
     path = tmp_path / "two.toml"
-    path.write_text(FILE.replace("[formation.links]", f"[formation]\n{law}\n[formation.links]"), encoding="utf-8")
-    assert not [finding for finding in check(load(str(path))) if finding.severity in {"error", "warning"}]
+    path.write_text(FILE, encoding="utf-8")
+    plan = load(str(path), *settings)
+    assert not [finding for finding in check(plan) if finding.severity in {"error", "warning"}]
 
 
 def test_error_is_shown_as_it_is(tmp_path):
