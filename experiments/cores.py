@@ -65,6 +65,7 @@ def pool(count: int) -> Iterator[ProcessPoolExecutor | None]:
 def _prepare() -> None:
     """In each process: Ctrl-C is the parent's, and the process ends with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     gc.freeze()  # what the parent has made is no garbage, and its pages stay shared
     if "numpy.random" in sys.modules:
         sys.modules["numpy.random"].seed()  # a fork has the parent's state; `random` sees to that itself

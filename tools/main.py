@@ -6,6 +6,7 @@ import errno
 import inspect
 import os
 import re
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -143,6 +144,7 @@ def part_for(words: Sequence[str], whole: typer.Typer = app) -> typer.Typer:
 
 def main() -> None:
     """Run the command of the command line."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # batch systems end a sweep so: what is done is kept
     call(app if COMPLETING in os.environ else part_for(sys.argv[1:]))
 
 

@@ -80,6 +80,7 @@ def interrupted(folder, end):
     [
         pytest.param(signal.SIGKILL, -signal.SIGKILL, "", marks=pytest.mark.mechanism("sweep: killed")),
         (signal.SIGINT, 130, "the same command goes on from here"),
+        (signal.SIGTERM, 130, "the same command goes on from here"),
     ],
 )
 def test_ended_sweep_leaves_no_process_and_resumes(tmp_path, whole_table, number, code, words):
