@@ -18,6 +18,16 @@ def wrap(angle: Array) -> Array:
     return np.asarray(pi - np.mod(pi - angle, tau))
 
 
+def rounded(values: Array) -> Array:
+    """Values rounded to six decimals as Python does: numpy errs where a value lies next to the middle of two."""
+    scaled = values * 1e6
+    whole = np.rint(scaled)
+    found = whole / 1e6
+    near = np.abs(np.abs(scaled - whole) - 0.5) <= np.spacing(np.abs(scaled))
+    found[near] = [round(each, 6) for each in values[near].tolist()]
+    return np.asarray(found)
+
+
 def known_rows(values: Iterable[Sequence[float] | float | None], width: int = 1) -> Array:
     """Numbers or vectors as rows (n, width); NaN where there is none."""
     blank = nan if width == 1 else (nan,) * width

@@ -4,23 +4,22 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from functools import cached_property
-from itertools import accumulate, pairwise, repeat
+from itertools import accumulate, cycle, pairwise, repeat
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import msgspec
 import numpy as np
 from msgspec.structs import replace
 
 from agents.decision.lifecycle import FINISHED, SCRIPTED, Phase
-from agents.decision.stepping import Words
 from agents.network import messages
 from agents.safety.hazards import Outcome
 from agents.ticks import ROUNDING_S
-from experiments.arrays import PoseTable
+from experiments.arrays import PoseTable, rounded
 from experiments.definition.experiment import WALL
 from experiments.definition.graph import Links
 from experiments.definition.plan import Plan
@@ -42,8 +41,6 @@ from twins.arrays import Array, Index
 SAMPLED: Final = ("position", "yaw", "true_position", "goal", "setpoint")  # columns of a log that a trace has as well
 MANY_ROWS: Final = 10_000
 LARGE_CHUNK_BYTES: Final = 512 * 1024  # size for a run that is over: there is nothing to be lost by a kill
-
-T = TypeVar("T")
 
 
 class RunRecorder:
@@ -132,7 +129,7 @@ class RunRecorder:
         yield [messages.Event(EPOCH + t, *said) for t, *said in self._events()]
         yield self._poses(self._log.sent)
         yield self._memories()
-        yield (state for _, states in self._states() for state in states)
+        yield self._states()
         if self._log.centre is not None and self.goals is not None:
             yield (goal for _, goal in self._goal_messages(self._log.centre))
             yield [self._centre_report(self.goals)]
@@ -144,21 +141,28 @@ class RunRecorder:
         return self._experiment.network.encoding
 
     def _poses(self, sent: PoseTable) -> Iterator[messages.Pose]:
-        names = self._log.names
-        assert sent.yaw is not None
-        columns = (sent.stamp, sent.link, sent.seq, sent.position, sent.velocity, sent.yaw)
-        words = self._words(sent)
-        for t, row, seq, position, velocity, yaw in _rows(columns):
-            yield messages.pose(names[row], seq, EPOCH + t, position, velocity, yaw=yaw, words=next(words))
+        """Poses as `messages.pose` makes them."""
+        for begin in range(0, len(sent), MANY_ROWS):
+            part = sent.take(slice(begin, begin + MANY_ROWS))
+            assert part.yaw is not None
+            yield from map(
+                messages.Pose,
+                [self._log.names[row] for row in part.link.tolist()],
+                part.seq.tolist(),
+                rounded(EPOCH + part.stamp).tolist(),
+                rounded(part.position).tolist(),
+                _values(rounded(part.velocity)),
+                _values(rounded(_headings(part.yaw))),
+                self._shared(part),
+            )
 
-    def _words(self, sent: PoseTable) -> Iterator[Words]:
+    def _shared(self, sent: PoseTable) -> Iterable[list[messages.Variable]]:
         """Variables transmitted with each pose."""
-        ends = list(accumulate(self._log.says.values(), initial=0))
+        if sent.extra is None:
+            return repeat([])
+        ends = accumulate(self._log.says.values(), initial=0)
         spans = list(zip(self._log.says, pairwise(ends), strict=True))
-        for row in () if sent.extra is None else sent.extra.tolist():
-            yield tuple((name, tuple(row[begin:end])) for name, (begin, end) in spans)
-        while True:
-            yield ()
+        return (messages.variables((name, row[i:j]) for name, (i, j) in spans) for row in sent.extra.tolist())
 
     def _memories(self) -> Iterator[messages.LawMemory]:
         """Memory and measures of the laws at each sample."""
@@ -193,86 +197,88 @@ class RunRecorder:
             dropped=dict(zip(names, goals.dropped.tolist(), strict=True)),
         )
 
-    def _states(self) -> Iterator[tuple[float, list[messages.State]]]:
-        """Telemetry, sample by sample, with the poses that each robot received since the sample before."""
-        log = self._log
-        words = [phase.word for phase in Phase]
-        columns = [log.phase, log.position, log.velocity, log.yaw, log.goal, log.setpoint, log.error]
-        known = {what: column for what in OPTIONAL if (column := getattr(log, what)) is not None}
-        columns += [log.true_position, log.true_yaw, *known.values()]
-        arrived = zip(self._received_by_sample(), self._goals_by_sample(), strict=True)
-        for (k, t), (received, receipts) in zip(enumerate(log.time.tolist()), arrived, strict=True):
-            sample = [
-                column[k].tolist() for column in columns
-            ]  # one by one: all of them would take eight times as much
-            phase, position, velocity, yaw, goal, setpoint, error, truth, true_yaw, *more = sample
-            yield (
-                t,
-                [
-                    messages.State(
-                        name,
-                        k + 1,
-                        EPOCH + t,
-                        words[phase[row]],
-                        messages.vector(position[row]),
-                        messages.vector(velocity[row]),
-                        messages.heading(yaw[row]),
-                        messages.vector(goal[row]),
-                        None if setpoint[row][0] != setpoint[row][0] else tuple(setpoint[row]),
-                        error[row],
-                        messages.vector(truth[row]),
-                        messages.heading(true_yaw[row]),
-                        received.get(row, []),
-                        **_known(known, [each[row] for each in more]),
-                        goal_receipts=receipts.get(row, []),
-                    )
-                    for row, name in enumerate(log.names)
-                ],
+    def _states(self) -> Iterator[messages.State]:
+        """Telemetry, with the poses and goals that each robot received since its sample before."""
+        log, rows = self._log, len(self._log.names)
+        words = np.array([phase.word for phase in Phase])
+        received, receipts = self._received(), self._goal_receipts()
+        for begin in range(0, len(log.time), max(1, MANY_ROWS // rows)):
+            part = slice(begin, begin + max(1, MANY_ROWS // rows))
+            sample = np.repeat(np.arange(len(log.time))[part], rows)
+
+            def values(column: Array | None, part: slice = part) -> Iterable[Any]:
+                return repeat(None) if column is None else _values(column[part].reshape(-1, *column.shape[2:]))
+
+            yield from map(
+                messages.State,
+                cycle(log.names),
+                (sample + 1).tolist(),
+                (EPOCH + log.time[sample]).tolist(),
+                words[log.phase[part]].ravel().tolist(),
+                values(log.position),
+                values(log.velocity),
+                values(_headings(log.yaw)),
+                values(log.goal),
+                values(log.setpoint),
+                log.error[part].ravel().tolist(),
+                values(log.true_position),
+                values(_headings(log.true_yaw)),
+                received(part),
+                values(log.attitude),
+                values(log.shadow_position),
+                values(log.shadow_yaw),
+                receipts(part),
             )
 
-    def _received_by_sample(self) -> Iterator[dict[int, list[Any]]]:
+    def _received(self) -> Callable[[slice], Iterable[list[Any]]]:
         """Receipts as they are encoded: several robots receive the same pose at the same time."""
         names, got = self._log.names, self._log.received
-        columns = (self._links.sender[got.link], got.seq, got.arrival, np.arange(len(got)))
-        known = dict[tuple[int, int, float], msgspec.Raw]()
+        sender = self._links.sender[got.link]
+        arrivals = np.unique(got.arrival, return_inverse=True)[1]
+        same = (arrivals * len(names) + sender) * (got.seq.max(initial=0) + 1) + got.seq
 
-        def receipt(values: list[Any]) -> msgspec.Raw:
-            sender, seq, arrived, k = values
-            if (found := known.get((sender, seq, arrived))) is None:
-                if len(known) > MANY_ROWS:
-                    known.clear()
-                stamps = EPOCH + float(got.stamp[k]), EPOCH + arrived
-                moves = tuple(got.position[k].tolist()), tuple(got.velocity[k].tolist())
-                payload = messages.encode(messages.PoseReceipt(names[sender], seq, *stamps, *moves), self._encoding)
-                known[sender, seq, arrived] = found = msgspec.Raw(payload)
-            return found
+        def receipts(at: Index) -> list[msgspec.Raw]:
+            _, first, which = np.unique(same[at], return_index=True, return_inverse=True)
+            each = got.take(at[first])
+            made = map(
+                messages.PoseReceipt,
+                [names[row] for row in sender[at[first]].tolist()],
+                each.seq.tolist(),
+                (EPOCH + each.stamp).tolist(),
+                (EPOCH + each.arrival).tolist(),
+                each.position.tolist(),
+                each.velocity.tolist(),
+            )
+            encoded = [msgspec.Raw(messages.encode(receipt, self._encoding)) for receipt in made]
+            return [encoded[k] for k in which.tolist()]
 
-        return self._by_sample(got.arrival, self._links.receiver[got.link], columns, receipt)
+        return self._by_sample(got.arrival, self._links.receiver[got.link], receipts)
 
-    def _goals_by_sample(self) -> Iterator[dict[int, list[messages.GoalReceipt]]]:
+    def _goal_receipts(self) -> Callable[[slice], Iterable[list[Any]]]:
         if self._log.centre is None:
-            return repeat({}, len(self._log.time))
+            return lambda _: repeat([])
         got = self._log.centre.followed
         assert got.extra is not None
-
-        def receipt(values: list[Any]) -> messages.GoalReceipt:
-            seq, *times = values
-            return messages.GoalReceipt(seq, *(EPOCH + t for t in times))
-
-        return self._by_sample(got.arrival, got.link, (got.seq, got.stamp, got.extra[:, 0], got.arrival), receipt)
+        times = EPOCH + np.column_stack([got.stamp, got.extra[:, 0], got.arrival])
+        return self._by_sample(
+            got.arrival, got.link, lambda at: map(messages.GoalReceipt, got.seq[at].tolist(), *times[at].T.tolist())
+        )
 
     def _by_sample(
-        self, arrival: Array, row: Index, columns: Sequence[np.ndarray], receipt: Callable[[list[Any]], T]
-    ) -> Iterator[dict[int, list[T]]]:
-        """Arrivals before each sample by row, made sample by sample: a large run has millions."""
-        sample = np.searchsorted(self._log.time, arrival - ROUNDING_S)
-        order = np.argsort(sample, kind="stable")
-        bounds = np.searchsorted(sample[order], np.arange(len(self._log.time) + 1))
-        for begin, end in pairwise(bounds.tolist()):
-            at, found = order[begin:end], dict[int, list[T]]()
-            for robot, *values in zip(*(column[at].tolist() for column in (row, *columns)), strict=True):
-                found.setdefault(robot, []).append(receipt(values))
-            yield found
+        self, arrival: Array, row: Index, receipts: Callable[[Index], Iterable[Any]]
+    ) -> Callable[[slice], Iterable[list[Any]]]:
+        """Function of some samples: receipts of each robot at each of them, since the sample before."""
+        rows, samples = len(self._log.names), len(self._log.time)
+        key = np.searchsorted(self._log.time, arrival - ROUNDING_S) * rows + row
+        order = np.argsort(key, kind="stable")
+        bounds = np.searchsorted(key[order], np.arange(samples * rows + 1))
+
+        def of(part: slice) -> Iterable[list[Any]]:
+            ends = bounds[part.start * rows : part.stop * rows + 1]
+            found = list(receipts(order[ends[0] : ends[-1]]))
+            return [found[i:j] for i, j in pairwise((ends - ends[0]).tolist())]
+
+        return of
 
     def statuses(self) -> Iterator[messages.Status]:
         """The counters at the end of the run and at the end of everything."""
@@ -349,16 +355,17 @@ class RunRecorder:
         yield self._experiment.duration_s, "phase", "conductor", "landing"
 
 
-def _rows(columns: Sequence[np.ndarray]) -> Iterator[tuple[Any, ...]]:
-    """Rows of columns, some at a time as Python values: all of them would take eight times as much memory."""
-    for begin in range(0, len(columns[0]), MANY_ROWS):
-        yield from zip(*(column[begin : begin + MANY_ROWS].tolist() for column in columns), strict=True)
+def _values(column: Array) -> list[Any]:
+    """Values of a column for messages: None for a number or vector that is not finite."""
+    values: list[Any] = column.tolist()
+    known = np.isfinite(column)
+    for k in np.flatnonzero(~(known if known.ndim == 1 else known.all(axis=1))).tolist():
+        values[k] = None
+    return values
 
 
-def _known(names: Iterable[str], values: Iterable[float | list[float]]) -> dict[str, Any]:
-    """Values in the form of messages, by name: a tuple or a number; None if it is NaN."""
-    found: dict[str, Any] = {}
-    for name, value in zip(names, values, strict=True):
-        first = value[0] if isinstance(value, list) else value
-        found[name] = None if math.isnan(first) else tuple(value) if isinstance(value, list) else value
+def _headings(yaw: Array) -> Array:
+    """Yaws as `messages.heading` makes them."""
+    found, beyond = yaw.copy(), np.isfinite(yaw) & (np.abs(yaw) > math.pi)
+    found[beyond] = [math.remainder(each, math.tau) for each in yaw[beyond].tolist()]
     return found

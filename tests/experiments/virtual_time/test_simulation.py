@@ -4,10 +4,13 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from msgspec import structs
 
 from agents.body.interface import Disturbance
 from agents.body.limits import Safety
 from agents.decision.lifecycle import AIRBORNE, DONE, IDLE, LANDING, READY, RUNNING
+from agents.network import messages
 from agents.network.messages import Contact
 from experiments.definition.experiment import (
     Arena,
@@ -21,6 +24,8 @@ from experiments.definition.experiment import (
     WorldTable,
 )
 from experiments.definition.plan import Plan
+from experiments.recording.ros2.payload import unwrap
+from experiments.recording.trace import EPOCH
 from experiments.virtual_time.conductor import LEAD_S, Stuck
 from experiments.virtual_time.log import RunRecorder
 from experiments.virtual_time.simulation import VirtualRunLog, simulate
@@ -217,6 +222,25 @@ def test_logged_and_played_back_runs_are_the_same(log, tmp_path):
     trace, _ = played_back(recorder(log), tmp_path)
     assert trace.dropped.sum() > 50
     assert np.isfinite(trace.shadow_position).all(axis=(0, 2)).tolist() == [True, False]
+
+
+def test_recorded_poses_are_those_that_robots_send(log, tmp_path):
+    """Numbers in the middle of two that can be sent, and next to it; unknown ones; yaws beyond a turn."""
+    dice, count = np.random.default_rng(1), len(log.sent)
+    middle = dice.integers(-(10**8), 10**8, (2, count, 3)) * 5e-7
+    place, velocity = np.nextafter(middle, middle + dice.integers(-1, 2, middle.shape))
+    velocity[::7, 1] = np.nan
+    yaw = np.where(np.arange(count) % 5, dice.uniform(-20.0, 20.0, count), np.nan)
+    sent = structs.replace(log.sent, position=place, velocity=velocity, yaw=yaw)
+    recorder(replace(log, sent=sent)).record(tmp_path / "run.mcap", "")
+    with (tmp_path / "run.mcap").open("rb") as file:
+        found = make_reader(file).iter_messages(["/KH/pose", "/CF/pose"], log_time_order=False)
+        payloads = [unwrap(message.data, "json") for *_, message in found]
+    rows = zip(sent.link, sent.seq.tolist(), EPOCH + sent.stamp, place, velocity, yaw, strict=True)
+    assert payloads == [
+        messages.encode(messages.pose(log.names[row], seq, t, x.tolist(), v.tolist(), yaw=turn))
+        for row, seq, t, x, v, turn in rows
+    ]
 
 
 def test_a_trace_has_contacts_and_moving_things(log):
