@@ -34,8 +34,8 @@ Action = Literal["drive", "takeoff", "land", "stop"]
 
 OPEN_S: Final = 5.0  # deadline of the router's answer and of the first position of every row
 WORLD: Final = "world"  # the address of robots in the shared world process
-REPEAT_S: Final = 0.1  # period of repeated orders: the publisher drops samples when its queue is full
-HALT_S: Final = 3.0  # time for which `land` is repeated to a robot on wheels
+REPEAT_S: Final = 0.1  # period of a stop that is obeyed: a simulator that is restarted must know of it
+HALT_S: Final = 3.0  # time for which `land` is repeated to a robot on wheels, and each stop on every tick
 SUPERSEDED_S: Final = 1.0  # a shorter standstill costs no process its name
 STANDSTILL_S: Final = 1.0  # longest wait of `close` until stopped robots are measured to stand still
 
@@ -84,6 +84,10 @@ class _ExternalRobot:
     def goes_on(self, now: float) -> bool:
         """Whether the robot was stopped, and is not measured to stand."""
         return self.stopped and (self.flight.flying or norm(self.velocity(now)) > SETTLED)
+
+    def obeys(self, now: float) -> bool:
+        """Whether a stop has certainly arrived; motors may be on, or wheels turn, without a measured motion."""
+        return now - self.stopped_since > HALT_S and not self.goes_on(now)
 
 
 class ExternalSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -175,18 +179,8 @@ class ExternalBody(Body):
         for row, setpoint in enumerate(setpoints):
             if all(map(isfinite, setpoint)):
                 self._send_setpoint(row, setpoint)
-        now = self._now()
-        if now >= self._next_repeat and any(robot.repeated is not None for robot in self._robots):
-            self._next_repeat = now + REPEAT_S
-            with self._lock:
-                for row, robot in enumerate(self._robots):
-                    repeated = robot.repeated
-                    if repeated is None:
-                        continue
-                    if now > robot.repeated_until:
-                        robot.repeated = None
-                    else:
-                        self._put(row, msgspec.structs.replace(repeated, stamp=self._stamp()))
+        if any(robot.repeated is not None for robot in self._robots):
+            self._repeat_orders(self._now())
 
     def takeoff(self, rows: Sequence[int], heights: Sequence[float]) -> None:
         """See `Body.takeoff`; no effect on ground robots, or after a stop."""
@@ -310,6 +304,20 @@ class ExternalBody(Body):
             order = self._next_command(robot, action, height=height)
             robot.repeated, robot.repeated_until = order, self._now() + seconds
             self._put(row, order)
+
+    def _repeat_orders(self, now: float) -> None:
+        """Repeat orders on every tick, as setpoints are: each may be lost, and motors are on until one arrives."""
+        if due := now >= self._next_repeat:
+            self._next_repeat = now + REPEAT_S
+        with self._lock:
+            for row, robot in enumerate(self._robots):
+                repeated = robot.repeated
+                if repeated is None:
+                    continue
+                if now > robot.repeated_until:
+                    robot.repeated = None
+                elif due or not robot.obeys(now):
+                    self._put(row, msgspec.structs.replace(repeated, stamp=self._stamp()))
 
     def _outnumber_successor(self) -> None:
         """After a standstill, go on with numbers beyond those of a process that had the name meanwhile."""

@@ -446,6 +446,7 @@ class Runtime:
     def _skip_ticks(self, ticks: int) -> None:
         """Count a tick after `ticks` that are too late."""
         self.health.count_tick(ticks, self._dt)
+        self._router_due = -inf  # a slow loop looks on each of its ticks
         for robot in self.robots:
             robot.tick += ticks
 

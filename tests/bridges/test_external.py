@@ -190,7 +190,7 @@ def test_restarted_simulator_hears_orders_under_way(far):
     far.run(body, 0.1, (0.0, 0.0, 0.6, 0.0), NO_SETPOINT, NO_SETPOINT)
     far.told.clear()
     far.run(body, 1.0, (0.0, 0.0, 0.6, 0.0), NO_SETPOINT, NO_SETPOINT)
-    assert far.counts() == about({("CF01", "drive"): 50, ("TE01", "land"): 10})  # what is steered need not climb
+    assert far.counts() == about({("CF01", "drive"): 50, ("TE01", "land"): 50})  # what is steered need not climb
 
 
 def test_stop_is_repeated_as_the_last_word(far):
@@ -201,14 +201,14 @@ def test_stop_is_repeated_as_the_last_word(far):
     climbs = far.actions("CF01", "takeoff")
     assert {(command.seq, command.height) for command in climbs} == {(climbs[0].seq, 0.6)}
     assert {command.height for command in far.actions("TE01", "takeoff")} == {0.8}
-    assert far.counts() == about({("CF01", "takeoff"): 11, ("TE01", "takeoff"): 11})
+    assert far.counts() == about({("CF01", "takeoff"): 51, ("TE01", "takeoff"): 51})
     far.place |= {"CF01": (0.0, 0.0, 0.3), "TE01": (0.0, 0.0, 0.3)}
     far.run(body, 1.0)
-    assert far.counts() == about({("CF01", "takeoff"): 10, ("TE01", "takeoff"): 10})  # half-way up another may answer
+    assert far.counts() == about({("CF01", "takeoff"): 50, ("TE01", "takeoff"): 50})  # half-way up another may answer
     body.land(rows)
     assert far.run(body, 4.0).flying.tolist() == [True, True, False]
     assert {command.seq for command in far.actions("CF01", "land")} == {climbs[0].seq + 1}
-    assert far.counts() == about({("CF01", "land"): 41, ("TE01", "land"): 41, ("KH01", "land"): 31})
+    assert far.counts() == about({("CF01", "land"): 201, ("TE01", "land"): 201, ("KH01", "land"): 151})
     far.place["CF01"] = (0.0, 0.0, 0.01)
     assert far.run(body, 1.0).flying.tolist() == [False, True, False]
     far.told.clear()
@@ -219,11 +219,14 @@ def test_stop_is_repeated_as_the_last_word(far):
     assert state.flying.tolist() == [False, True, False]
     assert [UNANSWERED in note for note in state.note] == [False, True, False]  # the one on wheels stands
     assert {command.seq for command in far.actions("TE01", "stop")} == {climbs[0].seq + 2}
-    assert far.counts() == about({("CF01", "drive"): 150, ("TE01", "stop"): 31, ("KH01", "stop"): 31})
+    assert far.counts() == about({("CF01", "drive"): 150, ("TE01", "stop"): 151, ("KH01", "stop"): 151})
     far.place["TE01"] = HERE
     state = far.run(body, 1.0)
     assert not state.flying.any()
     assert not any(state.note)
+    far.counts()
+    far.run(body, 2.0)
+    assert far.counts() == about({("TE01", "stop"): 20, ("KH01", "stop"): 20})
 
 
 @pytest.mark.mechanism("external body: orders are repeated", "external body: router loss")

@@ -68,6 +68,7 @@ SAFETY: Final = {
     "battery low for 1 s": f"{ROW}[battery]",
     "gets no messages for 0.4 s queries its router, and without an answer in 0.3 s": f"{ROW}[hardly_cut]",
     "holds 1.3 to 1.8 s after the loss, and lands 10.3 to 10.8 s after it": f"{ROW}[cut_off] {ROW}[cut_wheels]",
+    "ticks that are 0.05 s late on average it holds within 2.5 s": f"{SCRIPT}slow_loop_misses_its_router_as_soon",
     "`neighbour_timeout_s` 1 s | hold | land after `offline_s` 10 s": f"{ROW}[cut_off] {ROW}[cut_shortly]",
     "no conductor for 2 s": f"{HAZARDS} system/test_hazards.py::test_robots_without_conductor_end_if_file_says_so",
     "was not ordered | `offline_s` 10 s": HAZARDS,

@@ -164,6 +164,14 @@ MUTANTS = {
         "experiments/real_time/processes/world.py", "if self._stopped.is_set():", "if False:",
         partial(test_safety.test_world_obeys_a_stop_itself, test_safety.UNHEARD["router suspended"]),
     ),
+    "order repeated ten times a second": (
+        "bridges/external.py", "elif due or not robot.obeys(now):", "elif due:",
+        partial(test_safety.test_orders_are_repeated_on_every_tick, "stop", 0.35),
+    ),
+    "router looked for on some ticks of a slow loop": (
+        LOOP, "        self._router_due = -inf  # a slow loop looks on each of its ticks\n", "",
+        partial(test_safety.test_slow_loop_misses_its_router_as_soon, 1),
+    ),
     "down while it begins to climb": (
         "bridges/measured_flight.py", "down = came_down or grounded_s > GROUNDED_S", "down = True",
         partial(test_safety.test_robot_ordered_down_in_its_climb_lands, "loss"),

@@ -215,6 +215,15 @@ def test_router_is_lost_after_its_last_words():
     assert fly(TRIO, slow, silent, settings=["duration_s=5"]).violations == []
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_slow_loop_misses_its_router_as_soon(seed):
+    """It looked for its router on some of its ticks alone, and held after 2.8 s, or not at all (seed 504632)."""
+    slow, silent = Fault(1.0, "late", "C", 0.05, 9.0), Fault(1.2, "pause", "router", lasts=9.0)
+    flight = fly(DRONE, slow, silent, settings=["duration_s=5"], seed=seed)
+    held = next(t for t, text in flight.robots["C"].hazards if text.startswith(f"hold: {SILENT}"))
+    assert 1.2 + 1.3 < held < 1.2 + 2.5
+
+
 SHORTLY_SILENT = Fault(0.5, "pause", "router", lasts=1.5), Fault(0.5, "cut", "A", lasts=1.0)
 
 
@@ -364,6 +373,16 @@ def test_world_obeys_a_stop_itself(fault):
     flight = fly(WORLD, fault, Fault(1.505, "estop"), settings=["rates.body_hz=50"])
     assert flight.robots["C"].off(after=1.505) < 1.505 + 0.1
     assert flight.violations == []
+
+
+@pytest.mark.parametrize(("order", "limit_s"), [("stop", 0.35), ("land", 2.3)])
+def test_orders_are_repeated_on_every_tick(order, limit_s):
+    """Ten times a second: motors stayed on for up to 3.2 s after a stop (seeds 160297 and 503847)."""
+    lossy = Fault(0.9, "loss", "world", 0.9, 9.0)
+    for seed in range(1, 5):
+        flight = fly(WORLD, lossy, Fault(AT_S, "order", "C", order), seed=seed)
+        assert flight.robots["C"].off(after=AT_S) < AT_S + limit_s
+        assert flight.violations == []
 
 
 @pytest.mark.parametrize("spoils", ["", "cut", "loss"])
