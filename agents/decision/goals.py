@@ -174,7 +174,7 @@ class GoalComputer:
         total = energy = 0.0
         for sender in self.neighbours.all:
             if sender.active:
-                error = law.error(sender.apart(position, predictor, t), sender.link)
+                error = abs(law.error(sender.apart(position, predictor, t), sender.link))
                 total, energy = total + error, energy + 0.5 * error * error
         for anchor in self._anchors:
             error = anchor.error(position)

@@ -28,7 +28,7 @@ class Gradient(Law, frozen=True):
         raise TypeError(f"{type(self).__name__} must define `pull`")
 
     def error(self, apart: Vector, link: Link) -> float:
-        """Error of a link [m], not negative."""
+        """Error of a link [m]; its sign does not count."""
         raise TypeError(f"{type(self).__name__} must define `error`")
 
 

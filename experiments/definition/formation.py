@@ -149,7 +149,7 @@ def law_offsets(law: Gradient, position: Array, received: Array, links: Links) -
 def law_errors(law: Gradient, position: Array, received: Array, links: Links) -> Array:
     """Error of each link (E,) [m], of robots at `position` (N, 3) that received senders at `received` (E, 3) [m]."""
     apart = (position[links.receiver] - received).tolist()
-    return np.array([law.error(tuple(away), link) for away, link in zip(apart, unlinked(links), strict=True)])
+    return np.abs([law.error(tuple(away), link) for away, link in zip(apart, unlinked(links), strict=True)])
 
 
 def anchor_offsets(held: Anchored, position: Array) -> Array:
@@ -220,7 +220,7 @@ def errors_over_time(law: Law, pattern: Pattern, time: Array, position: Array) -
                 if k == 0 or pattern.changes:
                     every = pattern.targets_at(t)
                     targets = [every[each] for each in columns]
-                error[k, columns] = [law.error(tuple(away), link) for away, link in zip(row, targets, strict=True)]
+                error[k, columns] = [abs(law.error(tuple(away), to)) for away, to in zip(row, targets, strict=True)]
     present = pattern.present(time, position)
     return error if present is None else np.where(present, error, np.nan)
 

@@ -306,7 +306,7 @@ class LinkTracker:
             if pattern.bounded:
                 self._present[k] = pattern.exists(k, elapsed, math.hypot(*away), was=self._present[k])
             if self._present[k] or not pattern.bounded:
-                found[k] = self._law.error(tuple(away), link) if self._counts[k] else BARE
+                found[k] = abs(self._law.error(tuple(away), link)) if self._counts[k] else BARE
         return found
 
     def of_robots(self, error: Array) -> Array:
