@@ -45,7 +45,7 @@ class VirtualConductor:
             return tick
         if min([robot.lifecycle.phase for robot in self._robots]) < self._stage:
             return max(tick, round((self._since + self._patience_s) / dt))
-        every = max(1, round(ORDERS_S / dt))
+        every = max(1, round(ORDERS_S / dt)) if self._stage < Phase.RUNNING else 1
         return -(-tick // every) * every
 
     def give_orders(self, t: float, dt: float) -> None:

@@ -18,6 +18,7 @@ import numpy as np
 from agents.body.interface import BodyState
 from agents.body.shadow_twin import shadowed
 from agents.decision.assignment import Assignment
+from agents.decision.lifecycle import AIRBORNE, DONE, RUNNING
 from agents.plugins.calls import explain, supervised
 from agents.plugins.law import View
 from agents.plugins.registry import FAILURES
@@ -184,7 +185,7 @@ class VirtualRun:
     def fly(self, *, landing: bool, progress: Callable[[float], object] = lambda _: None) -> None:
         """Flies until all robots are done, or to the end of the run without `landing`."""
         try:
-            self._fly(stretches_of(self), landing, progress)
+            self._fly(stretches_of(self, DONE if landing else RUNNING), landing, progress)
         except TornError:
             self._begin()
             self._fly(None, landing, progress)
@@ -219,7 +220,7 @@ class VirtualRun:
             self._tick = first = stretches.tick
             if goes_on and first < last and not stretches.moved:
                 stretches.order(self._give_orders)
-                first += 1
+                first, goes_on = first + 1, not self._conductor.over
         if not (goes_on and end < stretches.end) and stretches.leave():
             self._detect(self.time)
         return True
@@ -238,7 +239,7 @@ class VirtualRun:
 
         Raises Stuck if robots do not become ready or airborne, or end before.
         """
-        self.stretches = None if self.twin.together else stretches_of(self, to_start=True)
+        self.stretches = None if self.twin.together else stretches_of(self, AIRBORNE)
         while not self._conductor.over:
             self.observe(self.time)
             self._fly_stretch()

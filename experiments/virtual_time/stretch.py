@@ -16,7 +16,7 @@ from typing import Any, Final, Protocol, cast
 import msgspec
 import numpy as np
 
-from agents.decision.lifecycle import AIRBORNE, RUNNING
+from agents.decision.lifecycle import AIRBORNE, DONE, RUNNING
 from agents.plugins.planners import Itinerary
 from agents.robot import Robot
 from agents.vectors import UNKNOWN
@@ -40,7 +40,7 @@ LONGEST: Final = 10_000  # ticks of a stretch
 ROBOT_TICKS: Final = 1_000_000  # ticks of all its robots: noise is drawn, and room kept, for all of them beforehand
 LEAST: Final = 20  # ticks below which a stretch is followed by a pause
 PAUSE: Final = 40  # ticks that are flown in plain Python then
-AHEAD_S: Final = 5.0  # [s] most that a run takes from its begin to the common start, about
+AHEAD_S: Final = 5.0  # [s] most that a run takes from its begin to the common start, and to land, about
 ROOM: Final = 2  # more samples on a link than its delay asks for
 LATE, LATEST_S = 40.0, 60.0  # room for jitter: times its mean, of which one in 10¹⁷ is more, and [s]
 DRIVER: Final = """
@@ -121,10 +121,10 @@ class Flown(Protocol):
         ...
 
 
-def stretches_of(flight: Flown, *, to_start: bool = False) -> Stretches | None:
+def stretches_of(flight: Flown, last: int = RUNNING) -> Stretches | None:
     """Compiled stretches of a flight, where they are possible and pay; else None: then it is flown as it is."""
     WORK[0] += plain_s(flight.plan)
-    return None if WORK[0] < PAYS_S or not possible(flight) else Stretches(flight, to_start=to_start)
+    return None if WORK[0] < PAYS_S or not possible(flight) else Stretches(flight, last)
 
 
 def plain_s(plan: Plan) -> float:
@@ -197,11 +197,11 @@ class Stretches:
     end: int  # last tick of the present stretch
     moved: bool = False  # phases have moved on at the present tick, of which the rest of the first half is to be flown
 
-    def __init__(self, flight: Flown, *, to_start: bool = False) -> None:
-        """`to_start`: no stretch goes on beyond the common start."""
+    def __init__(self, flight: Flown, last: int = RUNNING) -> None:
+        """No stretch goes on beyond the end of the `last` phase."""
         self._flight = flight
         self._case = msgspec.json.encode(flight.plan.experiment) + str(flight.window is not None).encode()
-        self._to_start = to_start
+        self._last = last
         twins = flight.twin.twins
         network, rates = flight.network, flight.plan.experiment.rates
         says = network.says
@@ -240,7 +240,7 @@ class Stretches:
         rates, duration_s = flight.plan.experiment.rates, flight.robots[0].assignment.duration
         longest = max(min(LONGEST, ROBOT_TICKS // len(flight.robots)), LEAST)
         soon = k * flight.dt + AHEAD_S
-        ends = (soon if np.isnan(flight.start_at) else flight.start_at) + duration_s
+        ends = (soon if np.isnan(flight.start_at) else flight.start_at) + duration_s + AHEAD_S * (self._last == DONE)
         end = min(k + longest, round(max(ends, soon) / flight.dt))
         if self._refused or k < self._paused_until or end - k < LEAST:
             return False
@@ -328,13 +328,14 @@ class Stretches:
         return False
 
     def _live(self, image: Image, t: float) -> bool:
-        """Phases and plans move on at `t` [s]; returns False where it is more than a take-off or the common start."""
+        """Phases and plans move on at `t` [s], up to the end of the last one; returns False for what happens rarely."""
         robots, twins = self._flight.robots, self._flight.twin.twins
         self._first = None
         image.read(part for each in robots for part in (each.lifecycle, each.now, each.now.state, each.landing))
         moving = [row for row, robot in enumerate(robots) if not robot.is_steady(t)]
-        for life, lands_at in ((robots[row].lifecycle, robots[row].assignment.lands_at) for row in moving):
-            if not (life.climbing or (life.phase == AIRBORNE and not self._to_start and lands_at == np.inf)):
+        for robot in (robots[row] for row in moving):
+            life, together = robot.lifecycle, robot.assignment.lands_at == np.inf and not robot.landing.aside
+            if not (life.climbing or (AIRBORNE <= life.phase < self._last and together)):
                 return False
         for row in moving:
             robot, motion = robots[row], twins[row].motion
@@ -342,7 +343,9 @@ class Stretches:
             robot.live(t)
             if robot.takes_off:
                 self._flight.twin.takeoff((row,), (robot.assignment.hover,))
-                robot.takes_off = False
+            if robot.lands:
+                self._flight.twin.land((row,))
+            robot.takes_off = robot.lands = False
             image.write([robot, robot.lifecycle, robot.landing, motion])
         if self._itineraries:
             image.read(robots)
@@ -436,7 +439,9 @@ class Stretches:
             now = robot.now
             planned.first = first = robot.tick // every
             place = (now.position[0], now.position[1], robot.goals.ground) if robot.tick % every == 0 else UNKNOWN
-            for number in range(first, first + len(planned.targets) // 4 if robot.begun else first):
+            for number in range(
+                first, first + len(planned.targets) // 4 if robot.lifecycle.phase == RUNNING else first
+            ):
                 tick = k + number * every - robot.tick
                 if number > first and tick * flight.dt - begin >= itinerary.next_at - 1e-9:
                     self._leg = min(self._leg, tick)

@@ -374,12 +374,25 @@ def test_stretches_of_legs_hazards_and_users_laws():
     assert len(faults) == 1
 
 
-def test_take_off_and_common_start_are_compiled():
-    """A flight without a plan is two stretches: from the first robot that is ready to the end, and the landing."""
+def test_take_off_and_landing_are_compiled():
+    """A flight is one stretch, from the first robot that is ready until all are done, whether or not one has a plan."""
+    plan = LegTable(at_s=1.0, robot="A", plan={"kind": "line", "move_by": [0.0, 0.4], "speed": 0.2})
     for kind in ({"kind": "khepera4"}, {"kind": "crazyflie", "hover": 0.5}):
         robots = {"A": RobotTable(**kind, start=[0.0, 0.0]), "B": RobotTable(**kind, start=[0.5, 0.0])}
-        log, ticks = same(follower(robots=robots, formation=Formation(links={"A > B": 0.5, "B > A": 0.5})))
-        assert ticks >= (1.0 - log.time[0] / 4.0) * log.ticks - 5  # the flight lasts 4 s
+        for links, timeline in (({"A > B": 0.5, "B > A": 0.5}, []), ({"A > B": 0.5}, [plan])):
+            log, ticks = same(follower(robots=robots, formation=Formation(links=links), timeline=timeline))
+            assert ticks >= (log.ended - log.time[0]) * log.ticks / 4.0 - 5  # without take-off and landing it lasts 4 s
+
+
+def test_way_aside_before_a_landing_is_flown_plain():
+    """A drone above another one moves aside for 1.43 s before it lands."""
+    robots = {
+        name: RobotTable(kind="crazyflie", start=[x, 0.0], hover=z)
+        for name, x, z in (("A", 0.0, 1.2), ("B", 0.17, 0.4))
+    }
+    log, ticks = same(follower(robots=robots, formation=Formation(links={"A > B": 0.82, "B > A": 0.82})))
+    assert [change.cause.name for _, change in log.incidents] == ["BELOW", "BELOW"]
+    assert 0 < (log.ended - log.time[0]) * log.ticks / 4.0 - 143 - ticks < 10
 
 
 def test_law_outside_of_the_subset_is_flown_plain():
