@@ -20,6 +20,7 @@ from agents.network.shutdown import FAREWELL_S, STOPPED_S
 from agents.robot import Robot
 from agents.runtime.watchdog import AGAIN_S, DOWN_S, Watchdog
 from agents.ticks import Ticks
+from agents.vectors import NO_SETPOINT
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,7 @@ class Descent:
         timing: DescentTiming,
     ) -> None:
         self.begun = False  # the loop is over
+        self._resigned = False  # no answer came about the owner of the names, and the robots land
         self.airborne = False  # a row flew at the last reading of its body, or took off since
         self.asked_at = -inf  # end of the last wait for the owner of the names, on the clock `uptime` [s]
         self.reason_to_end: Callable[[], str | None] = lambda: None
@@ -62,6 +64,7 @@ class Descent:
         self._recover, self._timing = recover, timing
         self._limits = robots[0].assignment.limits  # those of the experiment
         self._everyone = tuple(range(len(robots)))
+        self._no_setpoints = [NO_SETPOINT] * len(robots)
         self._on_wheels = tuple(row for row, kind in enumerate(kinds) if not kind.flies)
         ceiling = self._limits.high[2] if any(kind.flies for kind in kinds) else 0.0
         longest_s = ceiling / timing.slowest  # [s] landing: what still descends after a limit would fall
@@ -86,7 +89,10 @@ class Descent:
         stood = ownership.check_standstill()
         if ownership.check_return(session) or stood:
             ownership.begin(session)
-        elif self._keeper.is_owner() or not ownership.linked:
+        elif self._keeper.is_owner():
+            self._resigned = False
+            return False
+        elif not ownership.linked or (self._resigned and not ownership.contested):
             return False
         limits, drives = self._limits, self._on_wheels
         began, self._keeper.hands_off = self._ticks.elapsed(), True
@@ -94,6 +100,7 @@ class Descent:
             waited = 0.0 if ownership.contested else self._ticks.elapsed() - began  # else the other owner drives them
             if waited > limits.offline_s or (waited > ANSWER_S and self.reason_to_end() is not None):
                 what = "stood still" if stood else "was cut off"
+                self._resigned = True  # its landing needs ticks
                 self._recover(f"it {what}, and for {waited:.0f} s no router answers about the owner of its name")
                 break
             if drives and waited > limits.neighbour_timeout_s:
@@ -166,6 +173,8 @@ class Descent:
                 with _noted(failures):
                     order(self._everyone)
                     obeyed = True
+            with _noted(failures):
+                self._body.command(self._no_setpoints)  # repeats an order to a body in another process
             if (obeyed and not self._in_the_air(failures)) or now > begin + limit_s:
                 break
             time.sleep(self._ticks.period)

@@ -75,6 +75,17 @@ def landing_without_router(look: Look, seen: Seen) -> str:
     return f"no router for {lasted:.1f} s, still {Phase(seen.phase).word}" if lasted else ""
 
 
+@rule(OF_ROBOTS, "It lands all after `offline_s`", inside=True)
+def landing_without_answer(look: Look, seen: Seen) -> str:
+    """A process that asks for the owner of its name commands its body again after `offline_s`."""
+    assert look.world.plan is not None
+    keeper, (process, at) = seen.inside.keeper, look.world.drivers.get(seen.name, (None, -inf))
+    silent_s = look.now - max(at, seen.process.resumed_at)
+    waits = keeper.hands_off and not keeper.ownership.contested and process is seen.process and seen.prompt
+    late = seen.flying and waits and silent_s > look.world.plan.experiment.safety.offline_s + 0.5
+    return f"no command for {silent_s:.1f} s, while it asks for its owner" if late else ""
+
+
 @rule(OF_ROBOTS, "land after `land_without_position_s` 0.3 s")
 def landing_without_position(look: Look, seen: Seen) -> str:
     word = look.world.readings.get(seen.name, ("",))[0]

@@ -40,6 +40,10 @@ MUTANTS = {
     "other owner forgotten when cut off again": (
         DESCENT, "stood or ownership.contested or", "stood or", former_owner("cut off again"),
     ),
+    "robot that waits for its owner for good": (
+        DESCENT, "self._resigned = True", "pass",
+        test_safety.test_robot_without_an_answer_about_its_owner_lands,
+    ),
     "displaced body landed by the watchdog": (
         WATCHDOG, "displaced = self._displaced()", "displaced = False", former_owner("in a loop that hangs"),
     ),
@@ -166,7 +170,11 @@ MUTANTS = {
     ),
     "order repeated ten times a second": (
         "bridges/external.py", "elif due or not robot.obeys(now):", "elif due:",
-        partial(test_safety.test_orders_are_repeated_on_every_tick, "stop", 0.35),
+        partial(test_safety.test_orders_are_repeated_on_every_tick, *test_safety.REPEATED["stop"]),
+    ),
+    "order of a broken loop repeated twice a second": (
+        DESCENT, "self._body.command(self._no_setpoints)", "pass",
+        partial(test_safety.test_orders_are_repeated_on_every_tick, *test_safety.REPEATED["broken loop"]),
     ),
     "router looked for on some ticks of a slow loop": (
         LOOP, "        self._router_due = -inf  # a slow loop looks on each of its ticks\n", "",

@@ -1,6 +1,7 @@
 """Promises of docs/safety.md, by the exact clock of the simulated laboratory."""
 
 from dataclasses import replace
+from itertools import pairwise
 from math import inf
 
 import pytest
@@ -224,6 +225,28 @@ def test_slow_loop_misses_its_router_as_soon(seed):
     assert 1.2 + 1.3 < held < 1.2 + 2.5
 
 
+@pytest.mark.parametrize("seed", [4, 5])
+def test_twin_stands_still_while_its_process_asks(seed):
+    """Answers took seconds, over a slow link, and a rule missed progress of the landing (seed 150074)."""
+    high = DRONE.replace("hover = 0.8", "hover = 1.8")
+    flight = fly(high, Fault(1.5, "slow", "C", 1500, 30.0), seed=seed)
+    (landing,) = flight.robots["C"].entered("landing")
+    assert landing + 12.0 < flight.robots["C"].off() < landing + 10.0 + 6.0
+    assert flight.violations == []
+
+
+def test_robot_without_an_answer_about_its_owner_lands():
+    """It waited anew before each tick, thus for good."""
+    flight = fly(DRONE, Fault(0.5, "slow", "C", 1500, 60.0), settings=["duration_s=20"], seed=3)
+    robot = flight.robots["C"]
+    commands = [t for t, _ in robot.commands]
+    asked_s, over = max((next_t - t, next_t) for t, next_t in pairwise(commands))
+    assert 10.0 < asked_s < 10.1
+    assert robot.entered("landing") == [pytest.approx(over, abs=SOON_S)]
+    assert over < robot.off() < over + 2.5
+    assert flight.violations == []
+
+
 SHORTLY_SILENT = Fault(0.5, "pause", "router", lasts=1.5), Fault(0.5, "cut", "A", lasts=1.0)
 
 
@@ -375,12 +398,19 @@ def test_world_obeys_a_stop_itself(fault):
     assert flight.violations == []
 
 
-@pytest.mark.parametrize(("order", "limit_s"), [("stop", 0.35), ("land", 2.3)])
-def test_orders_are_repeated_on_every_tick(order, limit_s):
+REPEATED = {
+    "stop": (Fault(AT_S, "order", "C", "stop"), 0.35),
+    "land": (Fault(AT_S, "order", "C", "land"), 2.3),
+    "broken loop": (Fault(AT_S, "body", "C", "error"), 2.6),
+}
+
+
+@pytest.mark.parametrize(("fault", "limit_s"), REPEATED.values(), ids=REPEATED)
+def test_orders_are_repeated_on_every_tick(fault, limit_s):
     """Ten times a second: motors stayed on for up to 3.2 s after a stop (seeds 160297 and 503847)."""
     lossy = Fault(0.9, "loss", "world", 0.9, 9.0)
     for seed in range(1, 5):
-        flight = fly(WORLD, lossy, Fault(AT_S, "order", "C", order), seed=seed)
+        flight = fly(WORLD, lossy, fault, seed=seed)
         assert flight.robots["C"].off(after=AT_S) < AT_S + limit_s
         assert flight.violations == []
 
