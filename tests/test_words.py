@@ -75,6 +75,10 @@ def files(place: str) -> list[Path]:
     return [file for end in ("py", "md") for file in sorted((ROOT / place).rglob(f"*.{end}"))] or [ROOT / place]
 
 
+def listed(found: list[str], why: str) -> str:
+    return "\n".join([f"{why} (CONTRIBUTING.md, rule 6)", *found])
+
+
 @pytest.mark.parametrize("place", PLACES)
 def test_texts_are_plain(place):
     found = []
@@ -85,7 +89,7 @@ def test_texts_are_plain(place):
                 said += FIRST.findall(text)
                 said += [each for each in sentences(text) if len(WORD.findall(each)) > LONGEST]
             found += [f"{file.relative_to(ROOT)}:{line}: {each}" for each in said]
-    assert not found, "\n".join(found)
+    assert not found, listed(found, "a phrase of PHRASES, a sentence too long or without a subject: name what is meant")
 
 
 def trailing_comments(file: Path) -> Iterator[tuple[int, str]]:
@@ -132,7 +136,7 @@ def test_names_are_nouns(place):
         for node in ast.walk(ast.parse(file.read_text("utf-8")))
         if names(node) in PRONOUNS
     ]
-    assert not found, "\n".join(found)
+    assert not found, listed(found, "a pronoun or participle as a name: take a noun of the field")
 
 
 @CODE
@@ -145,4 +149,6 @@ def test_lines_are_read_at_one_glance(place):
             for node in ast.walk(ast.parse(file.read_text("utf-8")))
             if crowded(node)
         ]
-    assert not found, "\n".join(found)
+    assert not found, listed(
+        found, "a comment begins with a noun, a verb or a unit; at most two targets in an assignment"
+    )

@@ -51,6 +51,12 @@ def parse(words: list[str]) -> None:
     command.make_context(name, words)
 
 
+def test_every_command_has_a_page():
+    text = "".join(page.read_text("utf-8") for page in PAGES)
+    missing = [name for name in COMMAND_LINE.commands if not re.search(rf"\./zenpark {name}\b", text)]
+    assert not missing, "no page in docs shows ./zenpark with these"
+
+
 @for_each("page", PAGES)
 def test_command_line_knows_every_command_of_a_page(page):
     for text in commands(page):

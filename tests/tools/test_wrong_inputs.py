@@ -5,6 +5,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import typer.main
 
 from agents.body.interface import BodyEntry, shared_devices
 from bridges.khepera4.kind import KHEPERA4
@@ -12,7 +13,7 @@ from experiments.check.safety import libraries
 from experiments.definition.plan import Plan
 from experiments.file.document import loads
 from tests.cases import mostly_slow
-from tools.main import main
+from tools.main import app, main
 from twins.body import TwinBody
 
 TRIANGLE = (Path(__file__).parents[2] / "experiments" / "catalogue" / "triangle.toml").read_text("utf-8")
@@ -29,6 +30,8 @@ FILES = (
     ("hover = 0.6", 'hover = 0.6\nbody = "radoi://0"', ":24:8: no 'radoi' among the bodies", "did you mean 'radio'?"),
 )
 
+GROUPS = ("cameras", "lab", "turtlebot")
+SIMPLE = ("clean", "list", "runs", "station")  # commands with no more than switches
 RUN = "run triangle.toml --virtual --no-report"
 COMMANDS = (
     (f"{RUN} --set cases.event.trigger.treshold=1", "trigger.treshold=1: ", "did you mean 'threshold'?"),
@@ -92,6 +95,16 @@ COMMANDS = (
     ("echo park//x", "'park//x' is not a key expression", "Write it like park/*/pose"),
     ("keys --connect @nope", "nope: cannot be read", "network.txt"),
     ("sweep triangle.toml seeds=5:1", "seeds=5:1: 5:1 goes down", "write seeds=1:5"),
+    ("preflight nope.toml", "nope.toml: neither a file nor an experiment", "known: aggregative, "),
+    ("course triangle.toml", "triangle.toml: cannot be written", "name another folder"),
+    ("mark --seed -1 full", "--seed: must be greater than or equal to 0", "`./zenpark mark --help`"),
+    ("top --realm *", "--realm: '*' cannot be a name", "use letters, digits and _"),
+    ("bridge nope", "'nope' is none of cameras, optitrack", "`./zenpark bridge --help`"),
+    ("docs x", "by the script ./zenpark", "in its folder: ./zenpark docs x"),
+    ("hardware x", "by the script ./zenpark", "in its folder: ./zenpark hardware x"),
+    ("test x", "by the script ./zenpark", "in its folder: ./zenpark test x"),
+    *((f"{name} nope", "No such command 'nope'", f"`./zenpark {name} --help`") for name in GROUPS),
+    *((f"{name} --nope", "No such option: --nope", f"`./zenpark {name} --help`") for name in SIMPLE),
 )
 
 
@@ -126,6 +139,11 @@ def test_a_file_is_refused(part, instead, told, remedy, refuse):
     assert said.startswith("zenpark: triangle.toml:")
     assert told in said
     assert remedy in said
+
+
+def test_every_command_has_a_row():
+    missing = {*typer.main.get_command(app).commands} - {row[0].partition(" ")[0] for row in COMMANDS}
+    assert not missing, "COMMANDS above has no wrong input of these"
 
 
 @pytest.mark.parametrize(("command", "told", "remedy"), mostly_slow(COMMANDS, 3), ids=[row[0] for row in COMMANDS])
