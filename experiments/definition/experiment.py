@@ -390,12 +390,6 @@ class Positioning(Coordinates, frozen=True):
         return self.source.partition("://")[2]
 
 
-# metrics of zenpark that a criterion can name; those of other distributions come beside them
-JUDGED: Final = (
-    *("f_hz", "messages", "bytes", "iae", "itae", "rmse", "acquired_s", "updates", "lost", "dropped"),
-    *("missed_deadlines", "residual", "settle_s", "collisions", "receivers"),
-    *("j2", "belief_rms", "belief_max", "closest"),  # fields of the case
-)
 MEAN: Final = "mean"  # mean over robots
 WORST: Final = "worst"  # worst robot
 

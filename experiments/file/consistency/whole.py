@@ -9,9 +9,9 @@ from agents.errors import did_you_mean
 from agents.plugins import files, registry
 from agents.plugins.laws import Gradient
 from agents.plugins.predictors import HOLD
-from experiments.definition.experiment import JUDGED, MEAN, WORST, Experiment, Hybrid
+from experiments.definition.experiment import MEAN, WORST, Experiment, Hybrid
 from experiments.definition.plan import Plan
-from experiments.file.choices import struct_of
+from experiments.file.choices import usable_metric
 from experiments.file.consistency import network
 from experiments.file.consistency.arena import arena_faults
 from experiments.file.consistency.formation import formation_faults
@@ -37,7 +37,9 @@ def consistency_faults(plan: Plan) -> Iterator[Fault]:
 
 def judged_metrics() -> list[str]:
     """Metrics that a criterion can name."""
-    return [*JUDGED, *registry.names(registry.METRICS)]
+    # a path, because the module of the figures imports those of files
+    figures = registry.find("experiments.metrics.metric:FIGURES", "metrics of zenpark")
+    return [*figures, *registry.names(registry.METRICS)]
 
 
 def criteria_faults(experiment: Experiment, cases: Collection[str]) -> Iterator[Fault]:
@@ -59,7 +61,7 @@ def criteria_faults(experiment: Experiment, cases: Collection[str]) -> Iterator[
 def _metric_faults(name: str, path: Path) -> Iterator[Fault]:
     if files.is_choice(name):
         try:
-            struct_of(registry.METRICS, name)
+            usable_metric(name)
         except registry.PluginError as error:
             yield Fault(path, str(error), "mend that file (docs/metrics.md)")
     elif name not in (known := judged_metrics()):
