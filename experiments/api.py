@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from agents.body.device_locks import Claims
     from agents.body.interface import Body, BodyEntry, BodyError, BodyFault, BodyRequest, BodyState, call_all
     from agents.body.kinds import KINDS, Flight, Holonomic, Kind, Steered, Wheels
-    from agents.formation.link import Link
+    from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_NOTHING, BY_RELATIVE, Link
     from agents.network.keys import Keys
     from agents.network.messages import RunOrder
     from agents.plugins.avoidance import Avoidance, measure_gap
@@ -69,7 +69,7 @@ __all__ = [  # noqa: RUF022 - by subject, as in docs/python.md
     "Environment", "Environments", "SingleAgent",
     # what laws and metrics get and raise
     "View", "NeighbourView", "Memory", "Values", "is_known", "Measure", "RobotFacts", "Severity", "Link", "PluginError",
-    "Measurement", "Array", "Positive", "NotNegative",
+    "BY_DISTANCE", "BY_RELATIVE", "BY_BEARING", "BY_NOTHING", "Measurement", "Array", "Positive", "NotNegative",
     # other bases of plug-ins
     "TriggerView", "Predictor", "Avoidance", "measure_gap", "EngineFactory", "PointMassEngine", "moving_models",
     # kinds and bodies

@@ -16,10 +16,11 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from math import isnan
-from traceback import extract_tb, walk_stack, walk_tb
+from traceback import walk_stack, walk_tb
 from types import FrameType
 from typing import Any, Final, NoReturn
 
+from agents.errors import join_names
 from agents.formation.link import Link
 from agents.plugins.files import plain
 from agents.plugins.law import Law, NeighbourView, View
@@ -59,9 +60,16 @@ def explain(error: BaseException, plugins: Iterable[tuple[str, object]]) -> Base
 def failure(what: str, plugin: object, error: BaseException) -> PluginError:
     """Error that names a plug-in which failed, with the last line of its file that was at work."""
     file = _file(plugin)
-    lines = [frame.lineno for frame in extract_tb(error.__traceback__) if frame.filename == file]
-    place = f"{file}:{lines[-1]}" if lines else file
-    return PluginError(f"the {what} {type(plugin).__name__} failed: {type(error).__name__}: {error} ({plain(place)})")
+    at = [(frame, line) for frame, line in walk_tb(error.__traceback__) if frame.f_code.co_filename == file]
+    place, hint = file, ""
+    if at:
+        frame, line = at[-1]
+        place, memory = f"{file}:{line}", frame.f_locals.get("memory", {})
+        if isinstance(error, KeyError) and "memory[" in linecache.getline(file, line) and error.args[0] not in memory:
+            hint = f"; `begin` gave no {error.args[0]!r}, only {join_names([*memory]) or 'an empty memory'}"
+    return PluginError(
+        f"the {what} {type(plugin).__name__} failed: {type(error).__name__}: {error}{hint} ({plain(place)})"
+    )
 
 
 def wrong(what: str, plugin: object, method: str, result: object, wanted: str) -> PluginError:

@@ -97,6 +97,11 @@ def struct_of(group: str, kind: str) -> type[msgspec.Struct]:
     return registry.struct(group, kind)
 
 
+def usable_metric(name: str) -> Any:  # noqa: ANN401 - a Metric: their module imports those of files
+    """The metric of a name; raises PluginError if it cannot be used."""
+    return registry.find("experiments.metrics.metric:usable_metric", "metrics")(name)
+
+
 def parameters(group: str, kind: str) -> list[str]:
     """Names of the parameters of a plug-in, none if it cannot be used."""
     try:

@@ -22,7 +22,7 @@ from agents.plugins import files, registry
 from agents.plugins.registry import split
 from experiments.catalogue.index import FOLDER
 from experiments.definition.experiment import Experiment
-from experiments.file.choices import PLACES, group_of, struct_of
+from experiments.file.choices import PLACES, group_of, struct_of, usable_metric
 from experiments.file.json_schema import CASE, described, map_children, table_of
 
 NONE: Final[Mapping[str, object]] = {}
@@ -87,6 +87,9 @@ def matching(asked: str) -> list[Entry]:
     end = sought.rpartition(".")[2]  # most patterns need not be compiled
     near = [entry for entry in entries() if sought and (end in entry.key or entry.key[-1].isupper())]
     found = [entry for entry in near if re.fullmatch("".join(map(_pattern, _split(entry.key))), sought)]
+    if not found and end.isupper():  # a name of a table
+        table = matching(sought.rpartition(".")[0])
+        return table if any(re.match(rf"{re.escape(table[0].key)}\.[A-Z]", each.key) for each in table) else []
     if not found:
         ends = [entry for entry in near if _has_end(entry, sought)]
         found = sorted(ends, key=lambda entry: len(entry.words))
@@ -112,7 +115,12 @@ def in_file(choice: str) -> list[Entry]:
             faults.append(fault)
             continue
         return list(_keys_below(PLACES[group], "", {"anyOf": [_inlined(table, definitions)]}))
-    bases = ", ".join(registry.BASES[group].partition(":")[2] for group in registry.STRUCTS)
+    try:
+        metric = usable_metric(name)
+        return [Entry(choice, metric.meaning, f"a metric: {metric.head}", "", "", False, f'metrics = ["{choice}"]')]
+    except registry.PluginError as fault:
+        faults.append(fault)
+    bases = ", ".join(registry.BASES[group].partition(":")[2] for group in registry.NAMED_BY_FILE)
     none = registry.PluginError(f"{choice} must be a class that inherits from one of {registry.FACE}'s {bases}")
     raise next((each for each in faults if "must be a class" not in str(each)), none)
 

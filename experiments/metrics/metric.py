@@ -408,9 +408,9 @@ def values_of(
             if name in OURS:
                 raise
             found[name] = [None] * count
-            frames = extract_tb(error.__traceback__)
-            at = next((each for each in reversed(frames) if each.filename != __file__), frames[-1])
-            where = f"{Path(at.filename).name}:{at.lineno}"
+            code, frames = metric.of.__code__, extract_tb(error.__traceback__)
+            lines = [each.lineno for each in frames if each.filename == code.co_filename]  # none for a wrong result
+            where = f"{Path(code.co_filename).name}:{lines[-1] if lines else code.co_firstlineno}"
             failed.append(f"metric {name} failed: {type(error).__name__}: {error} ({where})")
     return found, tuple(failed)
 

@@ -22,7 +22,8 @@ CODE = {page: BLOCK.findall(page.read_text("utf-8")) for page in PAGES}
 CODE |= {file: [file.read_text("utf-8")] for file in PROGRAMS}
 # what a plug-in that flies may import: nothing of it needs numpy or anything of `experiments`
 FLYING = """
-Law, Gradient, Control, Measure, Memory, Said, View, RobotFacts, Link, PluginError, Trigger, Predictor, Planner,
+Law, Gradient, Control, Measure, Memory, Said, View, RobotFacts, Link, BY_DISTANCE, BY_RELATIVE, BY_BEARING, BY_NOTHING,
+PluginError, Trigger, Predictor, Planner,
 Avoidance, measure_gap, Kind, KINDS, Ground, Body, BodyRequest, BodyState, BodyError,
 Wheels, Steered, Holonomic, Flight, call_all, Vector, norm, distance, clamp, wrap
 """.replace("\n", "")

@@ -214,6 +214,17 @@ def test_other_errors_stay_what_they_are():
     assert explained(again) is told
 
 
+def test_variable_that_begin_did_not_give_is_named():
+    class Forgets(Law):
+        def step(self, view, memory):
+            return Control(memory={"y": memory["z"]})
+
+    law = Forgets()
+    with pytest.raises(KeyError) as caught:
+        law.step(None, {"y": (0.0,)})
+    assert "KeyError: 'z'; `begin` gave no 'z', only y (" in str(failure("law", law, caught.value))
+
+
 NEEDS = 'unknown with NEEDS = "nothing": give the law NEEDS = '
 READS = {  # what a law reads of its view: field and remedy
     "distance": (lambda view: [each.link.distance for each in view.neighbours], f'link.distance, {NEEDS}"distance"'),

@@ -52,6 +52,7 @@ def test_example_is_a_part_of_a_file(entry):
         ("tello", 'robots.ROBOT.kind = "tello"'),
         ("safety", "safety"),
         ("formation.law", "formation.law"),
+        ("formation.links.LINK", "formation.links"),
     ],
 )
 def test_key_is_found_as_users_write_it(asked, first):
@@ -63,7 +64,7 @@ def test_key_is_found_as_users_write_it(asked, first):
 PURSUIT = '''
 from typing import Annotated
 from msgspec import Meta
-from zenpark import Law
+from zenpark import Law, Metric
 
 
 class Pursuit(Law, frozen=True):
@@ -73,6 +74,17 @@ class Pursuit(Law, frozen=True):
 
 
 class Other: ...
+
+
+class Way(Metric):
+    """Length of the way."""
+
+    label = "Way"
+    unit = "m"
+
+
+class Bare(Metric):
+    """Nothing."""
 '''
 
 
@@ -82,8 +94,11 @@ def test_class_of_a_file_is_explained(tmp_path, monkeypatch):
     told = invoke("explain", "pursuit.py:Pursuit").stdout
     for part in ("Goes after its neighbour.", "[formation]\n", "gain of the pursuit [1/s] [≥ 0.0, default: 0.5]"):
         assert part in told
+    assert "Length of the way." in (told := invoke("explain", "pursuit.py:Way").stdout)
+    assert "a metric: Way [m]" in told
     for choice, fault in {
-        "pursuit.py:Other": "Law, Planner",
+        "pursuit.py:Other": "Law, Planner.*, Metric",
+        "pursuit.py:Bare": "label",
         "pursuit.py:Third": "has no Third",
         "a.py:A": "a.py",
     }.items():
