@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import inf
-from typing import Final, Generic, Literal, TypeVar
+from typing import Any, Final, Generic, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -151,12 +151,12 @@ class FaultyLink(Generic[Item]):
 class Server(ABC):
     """Simulated far end of a protocol."""
 
-    def sockets(self) -> Sequence[socket.socket]:
-        """Sockets to wait on; read again after every `serve`, because clients come and go."""
+    def sockets(self) -> Sequence[socket.socket | int]:
+        """Sockets, or descriptors of terminals, to wait on; read again after every `serve`: clients come and go."""
         return ()
 
-    def serve(self, ready: socket.socket, t: float) -> None:  # noqa: B027 - not called without sockets
-        """Read from a socket that is ready, at time `t` [s]. Never blocks."""
+    def serve(self, ready: Any, t: float) -> None:  # noqa: ANN401, B027 - not called without sockets
+        """Read from one of `sockets()` that is ready, at time `t` [s]. Never blocks."""
 
     @abstractmethod
     def advance(self, t: float) -> None:

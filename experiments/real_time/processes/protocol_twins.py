@@ -80,7 +80,7 @@ def by_hand(
         raise refusal(f"zenpark twin {kind}", "there is no such protocol twin", hint)
     hover = 0.8 if KINDS[kind].flies else None
     robots = {
-        f"{kind[:2].upper()}{k + 1:02}": RobotTable(
+        f"{KINDS[kind].prefix}{k + 1:02}": RobotTable(
             kind=kind, start=[0.5 * k, 0.0], body=word, hover=hover, device=settings
         )
         for k in range(count)

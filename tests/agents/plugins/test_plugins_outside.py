@@ -7,6 +7,7 @@ import shlex
 import socket
 import threading
 import tomllib
+from contextlib import closing
 from dataclasses import replace
 from math import isnan, nan
 from types import SimpleNamespace
@@ -237,6 +238,17 @@ def test_twin_of_the_docs_answers_its_body():
         over.set()
         thread.join()
         body.close()
+
+
+def test_twin_of_the_docs_stops_without_commands():
+    twin = made_in_guide("RoverTwin")(DeviceRequest(request("khepera4", "rover-twin"), Faults()))
+    (wire,) = twin.sockets()
+    with closing(twin), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.sendto(b'{"v": 0.1, "w": 0.0}', wire.getsockname())
+        twin.serve(wire, 0.0)
+        for tick in range(1, 501):
+            twin.advance(0.01 * tick)
+    assert 0.03 < twin.truth()[0][0, 0] < 0.06
 
 
 def test_devices_of_the_docs_have_one_driver(runtime_folder):
