@@ -52,6 +52,7 @@ class Metric(msgspec.Struct, frozen=True):
     relative: ClassVar[bool] = True  # sweeps, limits and searches take it over the reference
     swept: ClassVar[bool] = True  # a column of sweeps
     shown: ClassVar[bool] = True  # a column in the terminal and in the tables of reports
+    console: ClassVar[bool] = False  # figure of ours in a line of the terminal; others are there if `shown`
     figure: ClassVar[bool] = False  # a bar; with `relative` and `shown` a Pareto front as well
     needs: ClassVar[tuple[str, ...]] = ("true_position",)  # fields of the trace: a sweep keeps these
 
@@ -108,20 +109,21 @@ OF_CASE: Final = {"per": "case", "swept": False, "shown": False}
 OURS: Final[Mapping[str, Metric]] = {  # names of the fields of `RobotMetrics`, and then those of the case
     "f_hz": _row("rate", "f",
         "Transmissions over duration. Counted by running numbers, so that what a recorder lost counts too.", unit="Hz",
-        relative=False, figure=True),
+        relative=False, console=True, figure=True),
     "messages": _row(lambda m: m.transmissions[0], "Messages", "Transmissions of a robot, by their running numbers."),
     "bytes": _row("payload", "Payload", "Payload of the transmissions of a robot.", unit="bytes", swept=False,
         shown=False),
     "iae": _row(lambda m: m.integrals[0], "IAE", "Integral of e(t) over the run (trapezoidal).", unit="m s", sums=True,
-        figure=True),
+        console=True, figure=True),
     "itae": _row(lambda m: m.integrals[1], "ITAE", "Integral of t · e(t); t counts from the common start.",
         unit="m s²", sums=True, figure=True),
-    "rmse": _row(lambda m: m.integrals[2], "RMSE", "Root of the mean of e(t)².", unit="m", shown=False, figure=True),
+    "rmse": _row(lambda m: m.integrals[2], "RMSE", "Root of the mean of e(t)².", unit="m", shown=False,
+        console=True, figure=True),
     "acquired_s": _row("acquired", "Acquired",
         "From when on the moving mean over one second of the error of each link stays within the tolerance, until the"
         " next phase or the end; 0 if it never left. \"By all\" is when the last follower was there; the mean over"
         " followers is of their own times, and is given only if every follower acquired.", unit="s", mean="all",
-        relative=False),
+        relative=False, console=True),
     "updates": _row("trace.decisions", "Updates", "Goals that a robot recomputed.", relative=False, shown=False),
     "lost": _row("trace.lost", "Lost samples", "Poses that by their numbers were sent and never reached a receiver.",
         **UNSEEN),
@@ -182,7 +184,6 @@ DETAILS: Final[dict[str, Metric]] = {  # fields of `RobotMetrics` without a mean
         "Foreign poses", "Poses in the robot's name that did not come from its process, and were refused."),
 }  # fmt: skip
 FIGURES: Final = {**OURS, **DETAILS}  # figures of ours: those of robots are the fields of `RobotMetrics`
-CONSOLE: Final = ("f_hz", "iae", "rmse", "acquired_s")  # those of ours in a line of the terminal
 ERRORS: Final = tuple(name for name, metric in OURS.items() if metric.figure and metric.relative)
 TAKEN: Final = {  # columns of tables
     *RobotMetrics.__struct_fields__, *CaseMetrics.__struct_fields__,
@@ -289,10 +290,10 @@ def _has_value(case: CaseMetrics, name: str) -> bool:
     return any(value is not None for value in values)
 
 
-def console_metrics() -> dict[str, Metric]:
-    """Metrics in a line of the terminal."""
-    added = {name: metric for name, metric in foreign_metrics().items() if metric.shown}
-    return {name: OURS[name] for name in CONSOLE} | added
+def console_metrics(cases: Iterable[CaseMetrics] = ()) -> dict[str, Metric]:
+    """Metrics in a line of the terminal; of others, `foreign_metrics` of the cases."""
+    added = {name: metric for name, metric in foreign_metrics(cases).items() if metric.shown}
+    return {name: metric for name, metric in OURS.items() if metric.console} | added
 
 
 def terminal_labels(metrics: Mapping[str, Metric]) -> dict[str, str]:

@@ -435,7 +435,7 @@ def _hazards(runs: Sequence[Run]) -> Iterator[str]:
 
 def _case_line(name: str, runs: Sequence[Run], found: dict[str, Any]) -> str:
     """The key figures of a case, over all seeds: means of a robot; losses are sums over all robots."""
-    from experiments.metrics.metric import OF_LAW, foreign_metrics, terminal_labels
+    from experiments.metrics.metric import OF_LAW, OURS, console_metrics, terminal_labels
     from experiments.metrics.statistics import Spread, spread
     from experiments.report.page import interval
     from experiments.report.tables import ratio_words
@@ -447,18 +447,20 @@ def _case_line(name: str, runs: Sequence[Run], found: dict[str, Any]) -> str:
         means, shares = ({k: Spread(**v) for k, v in across[what].items()} for what in ("mean", "ratio"))
     mean, ratio = {k: interval(v) for k, v in means.items()}, {k: ratio_words(v) for k, v in shares.items()}
     measured = [each.metrics[name] for each in runs if name in each.metrics]
-    line = f"{name:>12}: f {mean['f_hz']} Hz per robot"
-    if case["mean"]["iae"] is None:
-        line += ", no link was measured"
-    else:
-        line += f", IAE {mean['iae']} m s, RMSE {mean['rmse']} m, {_acquired(mean['acquired_s'], measured)}"
-    foreign = foreign_metrics(measured).items()
-    added = {name: metric for name, metric in foreign if metric.shown and name in mean}
-    of_law = [each for each in added if each.startswith(OF_LAW)]
-    for each in of_law[0 if case["mean"]["iae"] is not None else FEW :]:  # measures stand for errors
-        del added[each]
-    labels = terminal_labels(added)
-    line += "".join(f", {labels[name]} {mean[name]} {metric.unit}".rstrip() for name, metric in added.items())
+    linked = case["mean"]["iae"] is not None
+    metrics = {each: metric for each, metric in console_metrics(measured).items() if each in mean}
+    for each in OURS:
+        if case["mean"].get(each) is None and not (linked and each == "acquired_s"):
+            metrics.pop(each, None)
+    of_law = [each for each in metrics if each.startswith(OF_LAW)]
+    for each in of_law[0 if linked else FEW :]:  # measures stand for errors
+        del metrics[each]
+    labels = terminal_labels(metrics)
+    parts = {each: f"{labels[each]} {mean[each]} {metric.unit}".rstrip() for each, metric in metrics.items()}
+    parts["f_hz"] += " per robot" if linked else " per robot, no link was measured"
+    if linked:
+        parts["acquired_s"] = _acquired(mean["acquired_s"], measured)
+    line = f"{name:>12}: {', '.join(parts.values())}"
     line += f", lost {sum(each.lost for each in measured)}"
     if missed := sum(each.missed_deadlines for each in measured):
         share = spread([each.missed_share for each in measured]).mean or 0.0
@@ -466,8 +468,8 @@ def _case_line(name: str, runs: Sequence[Run], found: dict[str, Any]) -> str:
     if dropped := sum(each.dropped for each in measured):
         line += f", {dropped} dropped by the modelled network"
     if name != next(iter(found["cases"])) and shares["f_hz"].mean is not None:
-        more = [f", {labels[name]} {ratio[name]}" for name, metric in added.items() if metric.relative]
-        line += f"   (ratios: f {ratio['f_hz']}, IAE {ratio['iae']}{''.join(more)})"
+        judged = [each for each, metric in metrics.items() if each == "f_hz" or (metric.relative and metric.shown)]
+        line += f"   (ratios: {', '.join(f'{labels[each]} {ratio[each]}' for each in judged)})"
     return line
 
 

@@ -3,6 +3,7 @@
 import csv
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import get_args, get_type_hints
 
 import msgspec
@@ -11,15 +12,18 @@ import pytest
 
 from agents.network.messages import Event
 from experiments.definition.experiment import AnchorTable, Shadow
+from experiments.file.consistency.whole import judged_metrics
 from experiments.metrics import metric, statistics
 from experiments.metrics.measure import measure
-from experiments.metrics.metric import FIGURES, OURS
+from experiments.metrics.metric import DETAILS, FIGURES, OURS
 from experiments.metrics.results import RobotMetrics
 from experiments.metrics.shadow import agreement
 from experiments.metrics.signals import Measurement, belief_errors, net_rotation
 from experiments.report import export, figures, metrics_files, report, tables, typeset, verdict
+from experiments.report.page import interval
 from experiments.sweep import table
 from tests.experiments.traces import STEP, at_origin, cut, pair, park, trace
+from tools.commands import run
 from tools.commands.explain import explain
 
 T = np.arange(0.0, 20.0 + STEP / 2, STEP)
@@ -37,14 +41,15 @@ def unseen(known, *holes):
 def test_numbers_of_robots_are_rows_of_figures():
     kinds = {name: {*get_args(kind), kind} for name, kind in get_type_hints(RobotMetrics).items()}
     numbers = {name for name, kind in kinds.items() if kind & {int, float} and not kind & {dict[str, float | None]}}
-    assert numbers == {name for name, metric in FIGURES.items() if metric.per == "robot"}
+    assert {*DETAILS} <= numbers <= {name for name, metric in FIGURES.items() if metric.per == "robot"}
     assert all(metric.label and metric.meaning.endswith(".") for metric in FIGURES.values())
     assert len({metric.head for metric in FIGURES.values()}) == len(FIGURES)
 
 
 def test_a_new_figure_is_one_row(tmp_path, monkeypatch, capsys):
-    row = metric._row(lambda m: m.trace.ticks * 2.0, "Twice", "Twice the ticks.", unit="s²", figure=True)
-    monkeypatch.setattr(metric, "OURS", {**OURS, "twice": row})
+    row = metric._row(lambda m: m.trace.ticks * 2.0, "Twice", "Twice the ticks.", unit="s²", console=True, figure=True)
+    for table_of_rows in ("OURS", "FIGURES"):
+        monkeypatch.setattr(metric, table_of_rows, {**getattr(metric, table_of_rows), "twice": row})
     before, after = pair(1.0 + np.exp(-T)), pair(2.0 + np.exp(-T))
     cases = [measure(replace(before, case="a")), measure(replace(after, case="b"))]
     twice = 2.0 * float(before.ticks[1])
@@ -62,6 +67,9 @@ def test_a_new_figure_is_one_row(tmp_path, monkeypatch, capsys):
     assert ("Twice", "Twice the ticks.") in tables.definitions(cases)
     assert explain("twice") == 0
     assert "metric: Twice [s²]" in capsys.readouterr().out
+    line = run._case_line("b", [SimpleNamespace(metrics={each.case: each for each in cases})], document)
+    assert f", Twice {interval(statistics.spread([twice]))} s², lost 0" in line
+    assert "twice" in judged_metrics()
 
 
 def test_integrals_of_a_decaying_error():

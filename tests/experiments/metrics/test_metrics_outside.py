@@ -55,7 +55,7 @@ def installed(tmp_path_factory):
 def test_fields_of_the_page_have_their_shapes(short_trace):
     sizes = {"T": len(short_trace.time), "N": len(short_trace.robots), "E": len(short_trace.plan.pose_links)}
     shapes = {}
-    for names, given in re.findall(r"^\| (`.*`) \| (\([TNE].*\)) \|", GUIDE, re.MULTILINE):
+    for names, given in re.findall(r"^\| (`.*`) \| (\([TNE].*\)) \|", GUIDE.partition("`shared`")[0], re.MULTILINE):
         fields, found = re.findall(r"`(\w+)`", names), re.findall(r"\(([^)]+)\)", given)
         shapes |= dict(zip(fields, found * (len(fields) // len(found)), strict=True))
     assert {"time", "true_position", "goal", "dropped"} < shapes.keys()
@@ -87,6 +87,12 @@ def test_installed_metric_is_everywhere(installed):
     assert all(text in page for text in ("Way [m]", "Length of the path", "Gap [m] of the case", "broken failed"))
     assert "Way [m]" in shelled("report", "run", "--markdown").stdout
     assert read_origin(folder / "run").made_by.plugins == {"my-metrics": "0.1"}
+
+
+def test_guide_names_all_that_a_metric_gets(short_trace):
+    shared = {*vars(signals.Measurement(short_trace)), *vars(signals.Measurement)} - {"of"}
+    fields = {*metric._COLUMNS, *(name for name in shared if not name.startswith("_"))}
+    assert not {name for name in fields if f"`{name}`" not in GUIDE}, "a row of a table of docs/metrics.md"
 
 
 class Moves(Metric, frozen=True):
