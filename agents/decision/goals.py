@@ -165,10 +165,10 @@ class GoalComputer:
     def errors(self, t: float, position: Vector) -> None:
         """Compute `error` and `energy` of the links at `t` [s], as a robot at `position` [m] knows them.
 
-        A law that is no gradient has none: they are NaN.
+        Those of a law that is no gradient are of its last step, without `energy`, which is NaN.
         """
         if self.stepping is not None:
-            self.error = self.energy = nan
+            self.error, self.energy = self.stepping.error, nan
             return
         law, predictor = self.law, self.predictor
         total = energy = 0.0

@@ -6,7 +6,7 @@ Memory belongs to the decision, never to the law: a step returns it, and it is k
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from math import dist, inf, isfinite, nan
+from math import dist, inf, isfinite, isnan, nan
 from numbers import Real
 from typing import Any, ClassVar, Final
 
@@ -15,7 +15,7 @@ from agents.network.validation import ENORMOUS, MAX_NUMBERS
 from agents.plugins.calls import failure, wrong
 from agents.plugins.law import Control, Law, Memory, NeighbourView, RobotFacts, Said, Values, View, is_known
 from agents.plugins.registry import FAILURES, PluginError
-from agents.vectors import UNKNOWN, ZERO, Vector, is_finite
+from agents.vectors import UNKNOWN, ZERO, Vector, difference, is_finite
 
 Words = tuple[tuple[str, Values], ...]  # what a robot says beside its pose: variables by name
 
@@ -107,6 +107,7 @@ class Stepping:
         self.velocity, self.goal, self.yaw = REST, UNKNOWN, nan
         self.gives_velocity = self.gives_goal = False
         self.measures: Mapping[str, float] = {}  # likewise
+        self.error = nan  # Σ|e| of the links with known errors at the last step [m]; NaN without any
         self.moves = True  # the robot may move; set by its caller, and likewise
         self.scan: Any = None  # range readings
         self.deviation = nan  # deviation of what the neighbours believe [m]
@@ -179,6 +180,12 @@ class Stepping:
         self.goal = UNKNOWN if control.goal is None else control.goal
         self.yaw, self.memory = control.yaw, control.memory
         self.measures, self.stepped = control.measures, self.tick
+        total, known = 0.0, False
+        for each in view.neighbours:
+            error = abs(self.law.error(difference(view.position, each.position), each.link))
+            if not isnan(error):
+                total, known = total + error, True
+        self.error = total if known else nan
         if self.speech is not None:
             self.speech.update(self.memory)
 

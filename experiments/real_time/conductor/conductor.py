@@ -19,6 +19,7 @@ from agents.decision.lifecycle import PAUSED, TOLD_TO_END
 from agents.network import messages
 from agents.network.keys import Keys
 from agents.runtime.orders import LAND, STOP
+from experiments.definition.formation import targeted
 from experiments.file.document import write_json
 from experiments.real_time.conductor import run_view
 from experiments.real_time.conductor.case_processes import CaseContext, CaseProcesses
@@ -65,7 +66,8 @@ class CaseRun:
         self._keys = Keys(experiment.network.realm)
         # of each case, for all its processes here, however late they start
         self._clock = context.launcher.clock = Clock()
-        linked = {plan.names[row] for row in plan.links.receiver.tolist()} - {*plan.guided}
+        judged = plan.links.receiver[targeted(plan.law, plan.formation)]
+        linked = {plan.names[row] for row in judged.tolist()} - {*plan.guided}
         self._robots = {
             name: run_view.RobotView(linked=name in linked, left_because="standby" if robot.standby else "")
             for name, robot in experiment.robots.items()

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from math import dist, inf, isnan, nan
+from math import dist, hypot, inf, isnan, nan
 from typing import ClassVar
 
 import msgspec
@@ -41,6 +41,11 @@ class Counting(Law, frozen=True):
             velocity=(0.05, 0.0, nan),
             measures={"heard": float(len(view.known("count")))},
         )
+
+
+class Bare(Counting, frozen=True):
+    def error(self, apart, link):
+        return nan
 
 
 class Odd(Counting, frozen=True):
@@ -87,7 +92,8 @@ def test_memory_is_kept_where_a_robot_was_due():
             assert bench.robot.words == (("count", stepping.memory["count"]),)
     assert (stepping.memory, stepping.measures) == ({"count": (10.0,), "secret": (1.0, 2.0)}, {"heard": 0.0})
     assert bench.robot.setpoint[0] == pytest.approx(0.05, rel=0.2)
-    assert isnan(bench.robot.error)
+    assert bench.robot.error == pytest.approx(hypot(0.5, 0.5) - 0.5)  # of the two links that the file gives
+    assert isnan(running(Bare()).robot.error)
     odd = {"count": (3.0, 4.0), "other": (1.0,)}  # of another size
     bench.step(0.3, lambda bench: hear(bench, odd, {"count": (3.0,)}))
     assert stepping.measures == {"heard": 1.0}
