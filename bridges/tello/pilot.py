@@ -20,6 +20,7 @@ from bridges.tello import protocol
 
 SDK_RETRY_S: Final = 0.5  # pause between two attempts to enter SDK mode
 LAND_RETRY_S: Final = 1.0  # pause between two `land` without an answer
+LAND_SOON_S: Final = 0.2  # pause in the first second, until the drone descends: it may have kept its last sticks
 TAKEOFF_RETRY_S: Final = 6.0  # likewise of `takeoff`, which a drone answers when it is up
 SHORTEST_TAKEOFF_S: Final = 1.0  # no drone is up earlier
 TAKEOFF_S: Final = 20.0  # time after which the take-off has failed
@@ -79,6 +80,7 @@ class TelloPilot:
         self._state: Mapping[str, Any] = {}
         self._zero_yaw: int | None = None
         self._height, self._motors = 0, -1
+        self._landed_from = 0  # [cm] height at the order to land
         self._running = self.aloft = -math.inf  # last motion of the motors' clock, last time that it was not low
         self._began_at = self._sent_at = self._cut_at = self._up_at = self._ordered_up_at = -math.inf
         self._rested = 0  # seconds on the motors' clock since the drone rests
@@ -138,6 +140,7 @@ class TelloPilot:
         """Land at the current place; `reason` is for users."""
         if self.duty in (Duty.RISE, Duty.HOLD, Duty.FLY):
             self.trouble = reason or self.trouble
+            self._landed_from = self._height
             self._rest_sticks()
             self._begin(Duty.LAND, "land", now)
 
@@ -191,10 +194,8 @@ class TelloPilot:
         elif self.duty is Duty.LAND:
             if self._on_ground(now):  # the answer was lost
                 self._rest(self.trouble)
-            elif now - self._sent_at >= LAND_RETRY_S:
-                if self._sent_at == -math.inf:  # a step has failed
-                    self._rest_sticks()
-                self._send_and_await("land", now)
+            else:
+                self._repeat_landing(now)
         else:
             self._send_sticks(now, last_read)
 
@@ -217,6 +218,14 @@ class TelloPilot:
     def _on_ground(self, now: float) -> bool:
         """Whether the drone's state proves that it is on the ground, and has not begun a take-off."""
         return not self.silent(now) and now - max(self.aloft, self._running, self._ordered_up_at) > ON_GROUND_S
+
+    def _repeat_landing(self, now: float) -> None:
+        """Order the landing again when it is due; a drone that descends is left alone for longer."""
+        ignored = now - self._began_at < LAND_RETRY_S and self._height >= self._landed_from
+        if now - self._sent_at >= (LAND_SOON_S if ignored else LAND_RETRY_S):
+            if ignored or self._sent_at == -math.inf:  # a step has failed
+                self._rest_sticks()
+            self._send_and_await("land", now)
 
     def _rest(self, trouble: str) -> None:
         self.duty, self.trouble = Duty.REST, trouble

@@ -168,7 +168,7 @@ def test_lost_answers_and_lost_commands(grounded):
     grounded.pass_(6.5, h=80, time=6)  # it is up: the answer was lost
     assert grounded.duty is Duty.HOLD
     grounded.land()
-    grounded.pass_(2.2)
+    grounded.pass_(2.2, h=70)
     assert grounded.said[2:] == ["land", "land", "land"]
     grounded.pass_(3.3, h=10)  # it is down, its motors' clock stands
     assert (grounded.duty, grounded.flying) == (Duty.REST, False)
@@ -297,7 +297,7 @@ def test_refused_landing_is_repeated_until_down(grounded):
     for second in range(1, 5):
         grounded.answer(b"error", time=second, h=20 * (second - 1)).pass_(0.9)
         assert grounded.duty is Duty.LAND
-    assert grounded.said.count("land") == 5
+    assert grounded.said.count("land") == 8, "every 0.2 s at first"
     grounded.answer(b"ok", h=0).pass_(4.0)
     assert not grounded.flying
 
@@ -316,8 +316,16 @@ def test_drone_that_does_not_land_rests_its_sticks(airborne):
     airborne.aim(0.5, 0.0, 0.0, 0.0)
     assert airborne.pass_(0.1).sticks[-1] == (0, 50, 0, 0)
     airborne.forget().land()
-    assert airborne.pass_(1.0).sticks == [(0, 0, 0, 0)], "a landing that is obeyed is left alone"
+    assert airborne.pass_(1.0, h=70).sticks == [(0, 0, 0, 0)], "a landing that is obeyed is left alone"
     assert airborne.answer(b"error").sticks == [(0, 0, 0, 0)] * 2
+
+
+def test_lost_order_to_land_comes_again_soon(airborne):
+    """The drone went on by its last sticks for a second."""
+    airborne.land()
+    assert airborne.pass_(0.5).said == ["land"] * 3
+    assert airborne.sticks == [(0, 0, 0, 0)] * 3
+    assert airborne.pass_(0.4, h=70).said == ["land"] * 3
 
 
 def test_height_of_motion_capture_counts_in_the_air(grounded):
@@ -339,7 +347,7 @@ def test_silent_drone_is_landed_until_surely_down(airborne):
     assert airborne.pilot.silent(airborne.now)
     assert airborne.note.startswith("silent for 1 s")
     airborne.land()
-    assert airborne.forget().pass_(5.05).said == ["land"] * 5
+    assert airborne.forget().pass_(5.05).said == ["land"] * 8
     assert airborne.flying
     assert not airborne.pass_(15.0).flying
     assert "landed by itself" in airborne.note
