@@ -82,7 +82,7 @@ class Robot:
         self.now = Situation()  # situation of this tick
         self.tick = 0  # number of the next tick; 0 at the common start, so that robots decide together
         self.goal, self.goal_yaw = UNKNOWN, nan  # pursued [m], and wanted there [rad], NaN for any
-        self.error = 0.0  # Σ of the link errors as the robot knows them [m]; 0 if guided, NaN without a position
+        self.error = 0.0  # Σ of the link errors as the robot knows them [m]; NaN without a link or a position
         self.setpoint = NO_SETPOINT  # setpoint of the last tick, NaN where the body drives by itself
         self.changed = self.avoided = False  # decided setpoint changed by safety, by avoidance
         self.takes_off = self.lands = self.stops = False  # commands to the body on this tick
@@ -312,9 +312,10 @@ class Robot:
         self._asked = pose
         goals, transmitter, now = self.goals, self.transmitter, self.now
         goals.errors(t, now.position)
-        self.error = nan if now.invalid else goals.error
+        error = nan if now.invalid else goals.error  # 0 without a link: triggers rest
+        self.error = error if goals.judged else nan
         due = transmitter.transmits(
-            t, now.position, now.velocity, self.error, goals.energy, max(t - self.lifecycle.start_at, 0.0),
+            t, now.position, now.velocity, error, goals.energy, max(t - self.lifecycle.start_at, 0.0),
             goals.offset, self.setpoint,
         )  # fmt: skip
         if self._stepping is not None:

@@ -63,6 +63,7 @@ class GoalComputer:
         self.goal, self.yaw = UNKNOWN, nan  # decided last [m], and wanted there [rad], NaN for any
         self.offset = ZERO  # offset of the law at the last decision, before it was clamped [m]
         self.error = self.energy = 0.0  # Σ|e| of the links [m] and Σ ½e² [m²], of the last call of `errors`
+        self.judged = False  # True if that call found an active link or an anchor
 
     def update_links(self, t: float) -> None:
         """Update the active links at `t` [s] for neighbours that appeared or were lost."""
@@ -172,14 +173,16 @@ class GoalComputer:
             return
         law, predictor = self.law, self.predictor
         total = energy = 0.0
+        judged = len(self._anchors) > 0
         for sender in self.neighbours.all:
             if sender.active:
+                judged = True
                 error = abs(law.error(sender.apart(position, predictor, t), sender.link))
                 total, energy = total + error, energy + 0.5 * error * error
         for anchor in self._anchors:
             error = anchor.error(position)
             total, energy = total + error, energy + 0.5 * error * error
-        self.error, self.energy = total, energy
+        self.error, self.energy, self.judged = total, energy, judged
 
     def step(self, t: float, position: Vector, velocity: Vector, yaw: float, start: float) -> None:
         """Let a law that is no gradient step; for the arguments see `decide`. Quiet, if the law is."""

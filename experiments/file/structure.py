@@ -82,12 +82,12 @@ def _value(value: object, annotation: object, path: Path, note: str) -> list[Fau
         of_key, of_value = get_args(plain)
         for key, each in value.items():
             inner += _key(key, of_key, (*path, key)) or _value(each, of_value, (*path, key), note)
-    elif get_origin(plain) is list and isinstance(value, dict):
+    elif _many(plain) and isinstance(value, dict):
         header = ".".join(map(str, path))
         return [
             Fault(path, f"'{key_name(path)}' must be a list, not a table", f"write [[{header}]], with two brackets")
         ]
-    elif get_origin(plain) is list and isinstance(value, list):
+    elif _many(plain) and isinstance(value, list):
         for number, each in enumerate(value):
             inner += _value(each, get_args(plain)[0], (*path, number), note)
     elif get_origin(plain) in _UNIONS and isinstance(value, dict):
@@ -95,6 +95,11 @@ def _value(value: object, annotation: object, path: Path, note: str) -> list[Fau
         if len(tables) == 1 or (tables and tables[0].__struct_config__.tag_field is not None):
             return _one_table(value, tables, path)
     return inner or _judged(value, annotation, path, note)
+
+
+def _many(plain: object) -> bool:
+    """Whether an annotation is that of a list of any length, or of a tuple, which a frozen struct has in its place."""
+    return get_origin(plain) is list or (get_origin(plain) is tuple and get_args(plain)[-1] is ...)
 
 
 def table_faults(

@@ -1,6 +1,6 @@
 """The decision of a robot: received poses, neighbours that go and come back, orders, formations, leaders and plans."""
 
-from math import dist, inf, nan
+from math import dist, inf, isnan, nan
 
 import pytest
 
@@ -63,6 +63,11 @@ def test_lost_neighbour_is_left_out_until_found():
     swarm.step()
     assert active() == "BC"
     assert swarm.last("C", "goal") == pytest.approx((0.0, -0.5, 0.0), abs=1e-9)  # without links: it stays
+    assert robot.error > 0.0
+    for sender in "BC":
+        swarm.lose(sender, "A")
+    swarm.run(1.1)
+    assert isnan(robot.error), "of no link"
 
 
 def test_unreceived_neighbour_hides_no_lost_one():

@@ -35,9 +35,13 @@ from twins.engines.point_mass import model
 GUIDE = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"```python\n(.*?)```", GUIDE, re.DOTALL)
 # `my_laws.py`, registered as `spring = "my_laws:Spring"` under `[project.entry-points."zenpark.laws"]`
-REGISTERED = re.findall(
-    r'`([\w-]+) = "(\w+):(\w+)"`\s+under\s+`\[project\.entry-points\."(zenpark\.\w+)"\]`', GUIDE, re.DOTALL
-)
+REGISTERED = [
+    # a reader's own body may have the name of the guide's
+    (f"guide-{name}" if group in (registry.BODIES, registry.DEVICES) else name, *rest, group)
+    for name, *rest, group in re.findall(
+        r'`([\w-]+) = "(\w+):(\w+)"`\s+under\s+`\[project\.entry-points\."(zenpark\.\w+)"\]`', GUIDE, re.DOTALL
+    )
+]
 
 
 def source_of(name):

@@ -14,6 +14,7 @@ import pytest
 from agents.body.interface import BodyFault
 from agents.formation.link import BY_NOTHING
 from agents.plugins import registry
+from agents.vectors import Positive
 from experiments.catalogue import index
 from experiments.check.check import check
 from experiments.definition.experiment import LinkTable
@@ -22,7 +23,7 @@ from experiments.file import catalogue as entries
 from experiments.file import document
 from experiments.file.document import DocumentError, read
 from experiments.file.problems import line_column, nearest, places
-from experiments.file.structure import OBJECT, parse_object
+from experiments.file.structure import OBJECT, faults, parse_object
 from experiments.file.text import MAX_TEXT_BYTES
 from tests.experiments.traces import parse_links
 from tests.small import PERIODIC, changed
@@ -543,32 +544,53 @@ def test_one_case_may_be_named_as_text():
     assert list(document.chosen(document.load("triangle"), "event")) == ["event"]
 
 
-class RoverSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Zone(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    radius: Positive
+
+
+class Zoned(msgspec.Struct, frozen=True):
+    zones: tuple[Zone, ...] = ()
+    more: list[Zone] = []
+
+
+@pytest.mark.parametrize("name", ["zones", "more"])
+def test_faults_in_lists_of_tables_have_keys(name):
+    wrong = {name: [{"radius": 1.0}, {"radius": -1.0}, {"raduis": 1.0}]}
+    assert [(each.path, each.message, each.hint) for each in faults(wrong, Zoned)] == [
+        ((name, 1, "radius"), "'radius' must be a number > 0, not -1.0", ""),
+        ((name, 2, "raduis"), f"unknown key 'raduis' in '{name}[2]'", "did you mean 'radius'?"),
+    ]
+    assert [each.message for each in faults({name: {"radius": 1.0}}, Zoned)] == [
+        f"'{name}' must be a list, not a table"
+    ]
+
+
+class CrawlerSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     gear: Annotated[int, msgspec.Meta(ge=1, le=5)] = 1
 
 
-class Rovers(TwinBody):
+class Crawlers(TwinBody):
     """Body of a user."""
 
-    SETTINGS = RoverSettings
+    SETTINGS = CrawlerSettings
 
     @classmethod
     def faults(cls, robots):
         yield from super().faults(robots)
         for each in robots:
             if not each.address.endswith(":5005"):
-                yield BodyFault(each.name, ("body",), f"{each.name} has no port", "write rover://HOST:5005")
+                yield BodyFault(each.name, ("body",), f"{each.name} has no port", "write crawler://HOST:5005")
 
 
 def test_body_of_a_user_judges_its_robots(monkeypatch, write):
-    before, entry = registry.registered, EntryPoint("rover", f"{__name__}:Rovers", registry.BODIES)
-    mine = {registry.BODIES: {"rover": [entry]}}
+    before, entry = registry.registered, EntryPoint("crawler", f"{__name__}:Crawlers", registry.BODIES)
+    mine = {registry.BODIES: {"crawler": [entry]}}
     monkeypatch.setattr(registry, "registered", lambda group: before(group) | mine.get(group, {}))
-    wrong = TWO.replace("start = [0.0, 0.0]", 'start = [0.0, 0.0]\nbody = "rover://a"')
-    wrong += 'body = "rover://b:5005"\ndevice = { gear = 9 }\n'
+    wrong = TWO.replace("start = [0.0, 0.0]", 'start = [0.0, 0.0]\nbody = "crawler://a"')
+    wrong += 'body = "crawler://b:5005"\ndevice = { gear = 9 }\n'
     problems = [(each.line, each.message, each.hint) for each in refusal(write(wrong)).problems]
     assert problems == [
-        (6, "KH01 has no port", "write rover://HOST:5005"),
+        (6, "KH01 has no port", "write crawler://HOST:5005"),
         (11, "'gear' must be a whole number <= 5, not 9", "left out: 1"),
     ]
-    read(write(wrong.replace("rover://a", "rover://a:5005").replace("gear = 9", "gear = 2")))
+    read(write(wrong.replace("crawler://a", "crawler://a:5005").replace("gear = 9", "gear = 2")))
