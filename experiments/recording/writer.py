@@ -7,8 +7,8 @@ import zlib
 from collections import Counter, defaultdict
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
-from functools import cached_property, partial
+from dataclasses import dataclass, field
+from functools import partial
 from io import FileIO
 from math import inf
 from pathlib import Path
@@ -188,23 +188,14 @@ LATE_S: Final = 2.0  # age of a message on arrival above which its clock is wron
 LATEST_S: Final = 2.0**32  # a stamp beyond (the year 2106) is a broken clock; nanoseconds of it may not fit the file
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Written:
     """A topic as the file has it."""
 
     name: str  # name with `{robot}` for the robot's name
     kind: str  # the ROS 2 type
     schema: str
-
-    @cached_property
-    def of_robot(self) -> bool:
-        """Whether each robot has its own."""
-        return "{robot}" in self.name
-
-
-POSES: Final = _Written(DRAWN, viewers.POSE, viewers.POSE_SCHEMA)
-TRANSFORMS: Final = _Written(FRAMES, viewers.TF, viewers.TF_SCHEMA)
-SCENES: Final = _Written(SCENE, viewers.MARKERS, viewers.MARKERS_SCHEMA)
+    channels: dict[str, int] = field(default_factory=dict)  # by robot
 
 
 class Recording:
@@ -236,7 +227,6 @@ class Recording:
             chunk_bytes: Messages that are written together, and lost together by a kill [bytes].
         """
         self.path = path
-        self._channels: dict[tuple[str, str, str], int] = {}  # channels by type, topic, and robot where it has its own
         self._schemas: dict[str, int] = {}
         self._stamp = -inf  # [s, UTC] the last good one
         self._latest = 0  # [ns] the same
@@ -251,6 +241,9 @@ class Recording:
             for kind, topic in self._kinds.items()
             for each in payload.NAMES
         }
+        self._poses = _Written(DRAWN, viewers.POSE, viewers.POSE_SCHEMA)
+        self._transforms = _Written(FRAMES, viewers.TF, viewers.TF_SCHEMA)
+        self._scenes = _Written(SCENE, viewers.MARKERS, viewers.MARKERS_SCHEMA)
         self._over = ""  # why nothing more can be written
         try:
             file = _Unbuffered(path, "xb")
@@ -302,27 +295,31 @@ class Recording:
             if self._utc is not None:
                 now = self._utc()
                 logged = now if kind in (Pose, Goal) else min(now, max(now - LATE_S, logged))
-        self._add(self._topics[kind, encoding], message, payload.wrap(data, encoding), logged)
+        begun = self._nanoseconds(logged)
+        stamp = begun if message.stamp == logged else self._nanoseconds(message.stamp)
+        times = begun, stamp, getattr(message, "seq", 0) & 0xFFFFFFFF
+        robot = getattr(message, "robot", "")
+        self._add(self._topics[kind, encoding], robot, payload.wrap(data, encoding), times)
         if isinstance(message, State):
-            self._show(message, logged)
+            self._show(message, logged, times)
         elif isinstance(message, Event):
             self.flush()
 
-    def _show(self, state: State, logged: float) -> None:
-        """Writes a state for viewers: pose, transform, and now and then the scene."""
+    def _show(self, state: State, logged: float, times: tuple[int, int, int]) -> None:
+        """Writes a state for viewers: pose, transform, and now and then the scene; all have its times and number."""
         place = state.position if state.true_position is None else state.true_position
         if place is None:
             return
         with suppress(viewers.Unencodable):
-            self._add(POSES, state, viewers.pose(state), logged)
+            self._add(self._poses, state.robot, viewers.pose(state), times)
             self._places[state.robot] = place
             if not -FRAMES_S < logged - self._framed.get(state.robot, -inf) < FRAMES_S - ROUNDING_S:
                 self._framed[state.robot] = logged
-                self._add(TRANSFORMS, state, viewers.transform(state), logged)
+                self._add(self._transforms, "", viewers.transform(state), times)
             if self._draw is not None and not -SCENE_S < logged - self._scene_at < SCENE_S - ROUNDING_S:
                 self._scene_at = logged
                 drawn = viewers.markers(logged, self._draw(logged, self._places))
-                self._add(SCENES, state, drawn, logged)
+                self._add(self._scenes, "", drawn, times)
                 if self._show_scene is not None:
                     self._show_scene(drawn)
 
@@ -355,13 +352,11 @@ class Recording:
         self._file.attach(KINDS_JSON, "application/json", msgspec.json.encode(figures))
         self._file.describe(METADATA, about)
 
-    def _add(self, topic: _Written, message: Message, data: bytes, logged: float) -> None:
+    def _add(self, topic: _Written, robot: str, data: bytes, times: tuple[int, int, int]) -> None:
+        """`times`: log time and stamp [ns], and the number of the message."""
         # one channel for each topic: readers that look a topic up take the first of its channels alone
-        robot = getattr(message, "robot", "") if topic.of_robot else ""
-        channel = self._channels.get((topic.kind, topic.name, robot)) or self._register(topic, robot)
-        begun = self._nanoseconds(logged)
-        stamp = begun if message.stamp == logged else self._nanoseconds(message.stamp)
-        number = getattr(message, "seq", 0) & 0xFFFFFFFF
+        channel = topic.channels.get(robot) or self._register(topic, robot)
+        begun, stamp, number = times
         if self._over:
             raise RecordingError(self._over)
         try:
@@ -377,7 +372,7 @@ class Recording:
         if topic.kind not in self._schemas:
             self._schemas[topic.kind] = self._file.register_schema(topic.kind, topic.schema)
         channel = self._file.register_channel(topic.name.format(robot=robot), self._schemas[topic.kind])
-        self._channels[topic.kind, topic.name, robot] = channel
+        topic.channels[robot] = channel
         return channel
 
     def _nanoseconds(self, stamp: float) -> int:
