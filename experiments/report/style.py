@@ -157,7 +157,7 @@ def svg(figure: Figure) -> str:
     text = io.StringIO()
     with _laid_out(figure):
         figure.savefig(text, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
-    return re.sub(r' d="[^"]*"', lambda path: re.sub(r"(\.\d\d)\d+", r"\1", path[0]), text.getvalue())
+    return re.sub(r' d="[^"]*"', lambda path: re.sub(r"(?<=\.\d\d)\d+", "", path[0]), text.getvalue())
 
 
 def panel_height(panels: int, wanted: float) -> float:
