@@ -5,7 +5,7 @@ The methods of `Twin` but `place` and `refill` are quiet.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import inf, isfinite, nan
 from typing import TYPE_CHECKING
 
@@ -291,12 +291,23 @@ class TwinBody(Placeable):
         """Whether robots move in an engine that they share, and nothing is measured from outside."""
         return self._alone is None and not self._external
 
-    def move(self, t: float) -> bool:
+    def move(self, t: float, update: Callable[[], object] | None = None) -> bool:
         """The part of a step to `t` [s] that all robots make at once, after `begin_step` and before `end_step` of each.
 
         It sets their range readings; returns whether there are new ones.
+
+        Args:
+            update: Brings motions and carriers up to date, for readings; of a caller that pushes and takes the robots.
         """
-        self.engine.advance(self._since_start(t), [motion.wobble for motion in self.engine.motions])
+        since = self._since_start(t)
+        if update is None:
+            self.engine.advance(since, [motion.wobble for motion in self.engine.motions])
+        else:
+            self.engine.solve(since)
+            if self._sensors is not None and t >= self._sensors.next:
+                update()
+                for carrier, motion in zip(self.engine.carriers, self.engine.motions, strict=True):
+                    carrier.take(motion)
         return self._sensors is not None and self._sweep(t, self._sensors)
 
     def moved_to(self, t: float) -> None:

@@ -195,7 +195,7 @@ class _Written:
     name: str  # name with `{robot}` for the robot's name
     kind: str  # the ROS 2 type
     schema: str
-    channels: dict[str, int] = field(default_factory=dict)  # by robot
+    channels: dict[str, int] = field(default_factory=dict)  # number by robot
 
 
 class Recording:

@@ -61,8 +61,9 @@ class Steps:
                 parts = [goals, *goals.rare_parts()]
                 yield goals, Rare(partial(_step, goals), parts, parts)
         if self.stage is not None:
-            motions = self._twin.engine.motions
-            yield self.stage, Rare(self._advance, motions, motions)
+            engine = self._twin.engine
+            of_python = () if engine.carriers else engine.motions
+            yield self.stage, Rare(self._advance, engine.watched or of_python, of_python)
         if self.window is not None:
             yield self.window, Rare(lambda *_: None, (), ())  # a run fills it itself then
 
@@ -84,10 +85,12 @@ class Steps:
     def _advance(self, _: int, given: Any) -> None:  # noqa: ANN401 - an array of C
         """The engine moves all robots on; their sensors see."""
         t, twin = given[0], self._twin
-        scanned = twin.move(t)
+        engine = twin.engine
+        update = partial(self._image.read, [*engine.carriers, *engine.motions]) if engine.carriers else None
+        scanned = twin.move(t, update)
         self._touches += twin.touches()
-        if twin.engine.obstacles:
-            self.obstacles[t] = [tuple(each) for each in twin.engine.obstacles]
+        if engine.obstacles:
+            self.obstacles[t] = [tuple(each) for each in engine.obstacles]
         for robot in [member.robot for member in self._members] if scanned else ():
             if parts := robot.rare_parts():
                 self._within(Rare(lambda *_, robot=robot: robot.notice(), parts, parts), 0, None)

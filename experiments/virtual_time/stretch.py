@@ -203,11 +203,12 @@ class Stretches:
         self._case = msgspec.json.encode(flight.plan.experiment) + str(flight.window is not None).encode()
         self._last = last
         twins = flight.twin.twins
+        carriers = flight.twin.engine.carriers or [None] * len(twins)
         network, rates = flight.network, flight.plan.experiment.rates
         says = network.says
         self._members = [
-            Member(row, robot, twin, sum(says.values()))
-            for row, (robot, twin) in enumerate(zip(flight.robots, twins, strict=True))
+            Member(row, robot, twin, carrier, sum(says.values()))
+            for row, (robot, twin, carrier) in enumerate(zip(flight.robots, twins, carriers, strict=True))
         ]
         self._steps, self._ways = Steps(self._members, flight.twin, flight.touches, flight.window), list[LinkQueue]()
         for (robot, k), channel in zip(network.receivers, network.channels, strict=True):

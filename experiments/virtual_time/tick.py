@@ -8,7 +8,7 @@ from __future__ import annotations
 from array import array
 from collections.abc import Sequence
 from math import inf, nan
-from typing import ClassVar, Final, Protocol
+from typing import Any, ClassVar, Final, Protocol
 
 from agents.decision.neighbours import Neighbour
 from agents.decision.stepping import Speech, Stepping
@@ -94,18 +94,19 @@ class LinkQueue:
 class Member:
     """Robot with its twin, and the links on which it sends."""
 
-    __slots__ = ("robot", "row", "seq", "twin", "ways", "words")
+    __slots__ = ("carrier", "robot", "row", "seq", "twin", "ways", "words")
 
     row: int
     seq: int  # number of its last transmission
     robot: Robot
     twin: Twin
+    carrier: Any  # hold of an engine on it, or None
     ways: list[LinkQueue]
     words: array[float]  # words of the last transmission
 
-    def __init__(self, row: int, robot: Robot, twin: Twin, words: int) -> None:
+    def __init__(self, row: int, robot: Robot, twin: Twin, carrier: object, words: int) -> None:
         """`words`: numbers beside a pose."""
-        self.row, self.robot, self.twin = row, robot, twin
+        self.row, self.robot, self.twin, self.carrier = row, robot, twin, carrier
         self.seq, self.ways = 0, []
         self.words = array("d", (nan,)) * words
 
@@ -264,11 +265,15 @@ def begin_step(members: list[Member]) -> None:
     """First part of a step in a world."""
     for member in members:
         member.twin.begin_step()
+        if member.carrier is not None:
+            member.carrier.push(member.twin.motion)
 
 
 def end_step(members: list[Member], t: float, dt: float) -> None:
     """Last part of a step in a world to `t` [s], behind its engine's."""
     for member in members:
+        if member.carrier is not None:
+            member.carrier.take(member.twin.motion)
         member.twin.end_step(t, dt)
         member.twin.measure(member.robot.now.state)
 

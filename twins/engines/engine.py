@@ -8,7 +8,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import msgspec
 
@@ -70,6 +70,9 @@ class Engine(ABC):
 
     motions: Sequence[Motion]  # motions of the robots; the same objects for ever
     obstacles: Sequence[Pose]  # current poses of the obstacles
+    # holds on the robots, of engines that advance by quiet `push(motion)` of each, `solve`, and quiet `take(motion)`
+    carriers: Sequence[Any] = ()
+    watched: Sequence[Any] = ()  # carriers that `solve` looks at
 
     @abstractmethod
     def advance(self, t: float, wobble: Sequence[Planar]) -> None:
@@ -79,6 +82,9 @@ class Engine(ABC):
             t: Time for obstacles with a plan.
             wobble: Hover jitter: horizontal displacement added to each flying robot at the end of the step [m].
         """
+
+    def solve(self, t: float) -> None:  # noqa: B027 - of engines with carriers
+        """Part of `advance` between its carriers'."""
 
     def takeoff(self, rows: Sequence[int], heights: Sequence[float]) -> None:
         """Make flying robots climb to `heights` [m]."""

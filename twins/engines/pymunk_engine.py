@@ -5,20 +5,21 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
+from math import isfinite, sqrt
 from typing import Annotated, ClassVar, Final
 
 import pymunk
 import pymunk.batch
 from msgspec import Meta
 
-from agents.body.kinds import Flight, Kind, Wheels
+from agents.body.kinds import Flight, Wheels
 from agents.vectors import Share, Vector, clamp, is_finite
-from twins.engines.engine import Engine, EngineFactory, EngineInput, Mirrored, Pose, Touch, require_carried
+from twins.engines.engine import Engine, EngineFactory, EngineInput, Pose, Touch, require_carried
 from twins.engines.engine import Planar as Displacement
 from twins.engines.point_mass import moving_models, require_models
 from twins.engines.pymunk_contacts import Contacts, Layers
 from twins.engines.pymunk_space import ArenaSpace, Surfaces
-from twins.models.differential import Differential
+from twins.models.motion import Motion
 from twins.models.onboard_flight import TOUCHDOWN
 from twins.models.quadrotor import GRAVITY, Quadrotor
 
@@ -79,16 +80,19 @@ class PlanarEngine(Engine):
         self._ticks = 0
         self._fastest = GRAVITY * math.tan(choice.tilt) * stage.dt  # change of speed in a tick [m/s]
         self._found: list[Touch] = []
-        self._layers = _build_layers(stage)
+        self._layers, self._tall = _build_layers(stage), [kind.height for kind in stage.kinds]
         self._scene = stage.scene
         self._planned_poses: list[Pose] = list(stage.scene.start)
-        self._space, self._robots = self._build_space(stage, choice)
+        self._feet: list[tuple[_Flown, pymunk.PivotJoint, float]] = []  # friction of a landed robot, its force [N]
+        self._space, self.carriers = self._build_space(stage, choice)
+        self._high = [(row, each) for row, each in enumerate(self.carriers) if stage.kinds[row].flies]
+        self.watched = [each for _, each in self._high]
         self._planned = [k for k in self._space.obstacles if stage.scene.plans[k] is not None]
         self.obstacles: list[Pose] = list(stage.scene.start)
-        for robot, motion in zip(self._robots, self.motions, strict=True):
+        for robot, motion in zip(self.carriers, self.motions, strict=True):
             robot.put(motion.position, motion.yaw)
 
-    def _build_space(self, stage: EngineInput, choice: Planar) -> tuple[_Space, list[_RobotBody]]:
+    def _build_space(self, stage: EngineInput, choice: Planar) -> tuple[_Space, list[_Carrier]]:
         """Build the scene with its robots, and find the numbers of each body in it."""
         skin = 0.5 * choice.approach * self._step
         surfaces = Surfaces(choice.friction, choice.wall_friction, choice.traction, skin)
@@ -99,60 +103,50 @@ class PlanarEngine(Engine):
         contacts = Contacts(
             place.numbers, self._layers, self._step, skin, choice.restitution, choice.slide, self._found
         )
-        space, robots = _Space(place, contacts, choice.iterations), list[_RobotBody]()
+        space, robots = _Space(place, contacts, choice.iterations), list[_Carrier]()
         for row, kind in enumerate(stage.kinds):
-            body = place.rows[row]
-            wheels = place.wheels.get(row, body)
-            robots.append(_RobotBody(space.cells, space.begin(body), space.begin(wheels), kind, self._step))
-            if row in place.feet:
-                robots[row].foot, robots[row].grip = place.feet[row]
+            at, times = space.begin(place.rows[row]), (self._dt, self._step)
+            if stage.mirrored[row]:
+                robots.append(_Shown(space.cells, at, *times))
+            elif row in place.feet:
+                robots.append(flown := _Flown(space.cells, at, times, kind.mass, self._fastest))
+                self._feet.append((flown, *place.feet[row]))
+            else:
+                robots.append(_Driven(space.cells, at, *times, space.begin(place.wheels[row])))
         return space, robots
 
     def advance(self, t: float, wobble: Sequence[Displacement]) -> None:
-        step, dt = self._step, self._dt
-        for row, (robot, motion) in enumerate(zip(self._robots, self.motions, strict=True)):
-            if isinstance(motion, Quadrotor):
-                self._push_flying(row, robot, motion, wobble[row])
-            elif isinstance(motion, Differential):
-                robot.drive(motion, dt)
-            elif isinstance(motion, Mirrored):
-                self._show_mirrored(row, robot, motion)
+        for robot, motion, each in zip(self.carriers, self.motions, wobble, strict=True):
+            motion.wobble = each
+            robot.push(motion)
+        self.solve(t)
+        for robot, motion in zip(self.carriers, self.motions, strict=True):
+            robot.take(motion)
+
+    def solve(self, t: float) -> None:
+        for row, robot in self._high:
+            self._layers.bottom[row], self._layers.top[row] = robot.height, robot.height + self._tall[row]
+        for flown, foot, grip in self._feet:
+            if foot.max_force != (force := grip if flown.stands else 0.0):
+                foot.max_force = force
         if self._planned:
             self._move_planned(t)
-        self._space.advance(self._ticks * dt, step, self.steps)
+        self._space.advance(self._ticks * self._dt, self._step, self.steps)
         self._ticks += 1
-        for robot, motion in zip(self._robots, self.motions, strict=True):
-            if isinstance(motion, Quadrotor):
-                robot.take_flight(motion, step)
-            elif isinstance(motion, Differential):
-                robot.take_drive(motion, step)
-        self._space.read_obstacles(self.obstacles, step)
+        self._space.read_obstacles(self.obstacles, self._step)
 
     def place(
         self, rows: Sequence[int], positions: Sequence[Vector], yaws: Sequence[float], flying: Sequence[bool]
     ) -> None:
         super().place(rows, positions, yaws, flying)
         for row, position, yaw in zip(rows, positions, yaws, strict=True):
-            self._robots[row].put(position, yaw)
+            self.carriers[row].put(position, yaw)
         self._space.contacts.reset_rows(rows)
 
     def touches(self) -> list[Touch]:
         found = sorted(self._found, key=lambda touch: (touch.time, touch.first, touch.second))
         self._found.clear()
         return found
-
-    def _push_flying(self, row: int, robot: _RobotBody, flight: Quadrotor, wobble: Displacement) -> None:
-        """Apply the force that a flying robot's model asks for."""
-        height = robot.fly(flight, wobble, self._dt, self._fastest)
-        self._layers.bottom[row], self._layers.top[row] = height, height + robot.tall
-
-    def _show_mirrored(self, row: int, robot: _RobotBody, motion: Mirrored) -> None:
-        """Set a mirrored robot to its received pose; the solver sees its motion from there."""
-        motion.move(self._dt)
-        robot.show(motion, self._step)
-        if robot.flies:
-            height = motion.position[2]
-            self._layers.bottom[row], self._layers.top[row] = height, height + robot.tall
 
     def _move_planned(self, t: float) -> None:
         """Move obstacles by their plans, with the velocity that reaches the planned pose in this tick."""
@@ -171,18 +165,15 @@ class PlanarEngine(Engine):
         self._planned_poses = poses
 
 
-class _RobotBody:
-    """A robot's body, and its wheels, in the numbers of a space."""
+class _Carrier:
+    """A robot's body in the numbers of a space, from number `at` on."""
 
-    def __init__(self, cells: memoryview[float], at: int, wheels: int, kind: Kind, step: float) -> None:
-        """Numbers from `at` and, of the wheels, from `wheels` on."""
-        self._cells, self._at, self._wheels = cells, at, wheels
-        self._force = kind.mass / step  # changes the speed by 1 m/s in one step
-        self._wobble = self._drift = self._target = (0.0, 0.0)  # state of the last tick [m], [m/s], [m/s]
-        self._stands = True
-        self.flies, self.tall = kind.flies, kind.height  # [m]
-        self.foot: pymunk.PivotJoint | None = None  # friction of a landed robot with the floor,
-        self.grip = 0.0  # its force [N]
+    __slots__ = ("_at", "_cells", "_dt", "_step", "height")
+
+    def __init__(self, cells: memoryview[float], at: int, dt: float, step: float) -> None:
+        self._cells, self._at = cells, at
+        self._dt, self._step = dt, step  # [s] length of a tick, and of a step of the space
+        self.height = 0.0  # [m]
 
     def put(self, position: Vector, yaw: float) -> None:
         """Place the body at rest."""
@@ -190,34 +181,60 @@ class _RobotBody:
         cells[at + X], cells[at + Y] = position[0], position[1]
         cells[at + YAW] = yaw
         cells[at + V_X] = cells[at + V_Y] = cells[at + TURN] = 0.0
+
+
+class _Driven(_Carrier):
+    """Robot on wheels, of which the numbers begin at `wheels`."""
+
+    __slots__ = ("_wheels",)
+
+    def __init__(self, cells: memoryview[float], at: int, dt: float, step: float, wheels: int) -> None:
+        super().__init__(cells, at, dt, step)
+        self._wheels = wheels
+
+    def push(self, motion: Motion) -> None:
+        """Turn the wheels as their model does."""
+        before = motion.yaw
+        motion.move(self._dt)
+        cells, at = self._cells, self._wheels
+        cells[at + V_X], cells[at + V_Y] = motion.velocity[0], motion.velocity[1]
+        cells[at + TURN] = (motion.yaw - before) / self._dt
+
+    def take(self, motion: Motion) -> None:
+        cells, at, step = self._cells, self._at, self._step
+        v_x, v_y = cells[at + V_X], cells[at + V_Y]
+        motion.position = (cells[at + X] + step * v_x, cells[at + Y] + step * v_y, motion.position[2])
+        motion.velocity, motion.yaw = (v_x, v_y, 0.0), cells[at + YAW] + step * cells[at + TURN]
+
+
+class _Flown(_Carrier):
+    """Flying robot of which the speed changes by `fastest` [m/s] in a tick at most."""
+
+    __slots__ = ("_drift", "_fastest", "_force", "_target", "_wobble", "stands")
+
+    def __init__(
+        self, cells: memoryview[float], at: int, times: tuple[float, float], mass: float, fastest: float
+    ) -> None:
+        super().__init__(cells, at, *times)
+        self._force, self._fastest = mass / self._step, fastest  # changes the speed by 1 m/s in one step
+        self._wobble = self._drift = self._target = (0.0, 0.0)  # state of the last tick [m], [m/s], [m/s]
+        self.stands = True  # True on the floor, which holds it
+
+    def put(self, position: Vector, yaw: float) -> None:
+        super().put(position, yaw)
         self._wobble = (0.0, 0.0)
 
-    def drive(self, drive: Differential, dt: float) -> None:
-        """Turn the wheels as their model does."""
-        before = drive.yaw
-        drive.move(dt)
-        cells, at = self._cells, self._wheels
-        cells[at + V_X], cells[at + V_Y] = drive.velocity[0], drive.velocity[1]
-        cells[at + TURN] = (drive.yaw - before) / dt
-
-    def take_drive(self, drive: Differential, step: float) -> None:
-        """Give the model the state of the body."""
-        cells, at = self._cells, self._at
-        v_x, v_y = cells[at + V_X], cells[at + V_Y]
-        drive.position = (cells[at + X] + step * v_x, cells[at + Y] + step * v_y, drive.position[2])
-        drive.velocity, drive.yaw = (v_x, v_y, 0.0), cells[at + YAW] + step * cells[at + TURN]
-
-    def fly(self, flight: Quadrotor, wobble: Displacement, dt: float, fastest: float) -> float:
-        """Push the body to the velocity of its model and of the hover jitter; returns the height [m]."""
-        flight.wobble = wobble
-        before_x, before_y, _ = flight.velocity
-        flight.move(dt)
-        v_x, v_y, _ = flight.velocity
+    def push(self, motion: Quadrotor) -> None:
+        """Push the body to the velocity of its model and of the hover jitter."""
+        wobble, dt = motion.wobble, self._dt
+        before_x, before_y, _ = motion.velocity
+        motion.move(dt)
+        v_x, v_y, _ = motion.velocity
         d_x, d_y = v_x - before_x, v_y - before_y
-        size = math.sqrt(d_x * d_x + d_y * d_y)
-        if size > fastest:
-            d_x, d_y = d_x * (fastest / size), d_y * (fastest / size)
-        if not flight.flying:
+        size = sqrt(d_x * d_x + d_y * d_y)
+        if size > self._fastest:
+            d_x, d_y = d_x * (self._fastest / size), d_y * (self._fastest / size)
+        if not motion.flying:
             d_x = d_y = 0.0
         drift_x, drift_y = (wobble[0] - self._wobble[0]) / dt, (wobble[1] - self._wobble[1]) / dt
         target_x, target_y = before_x + d_x, before_y + d_y
@@ -226,38 +243,40 @@ class _RobotBody:
         cells[at + PUSH_X] = (target_x + drift_x - cells[at + V_X]) * self._force
         cells[at + PUSH_Y] = (target_y + drift_y - cells[at + V_Y]) * self._force
         self._target, self._drift = (target_x, target_y), (drift_x, drift_y)
-        height = flight.held[2]
-        stands = not flight.flying and height <= TOUCHDOWN and drift_x == 0.0 and drift_y == 0.0
-        if stands != self._stands and self.foot is not None:
-            self.foot.max_force = self.grip if stands else 0.0
-            self._stands = stands
-        return height
+        self.height = motion.held[2]
+        self.stands = not motion.flying and self.height <= TOUCHDOWN and drift_x == 0.0 and drift_y == 0.0
 
-    def take_flight(self, flight: Quadrotor, step: float) -> None:
-        """Give the model the state of the body."""
-        cells, at = self._cells, self._at
+    def take(self, motion: Quadrotor) -> None:
+        cells, at, step = self._cells, self._at, self._step
         v_x, v_y = cells[at + V_X], cells[at + V_Y]
         x, y = cells[at + X] + step * v_x, cells[at + Y] + step * v_y
         target_x = self._target[0] + _felt(v_x - (self._target[0] + self._drift[0]), self._drift[0])
         target_y = self._target[1] + _felt(v_y - (self._target[1] + self._drift[1]), self._drift[1])
-        _, _, z = flight.held
-        flight.velocity = (target_x, target_y, flight.velocity[2])
-        flight.held = (x - flight.wobble[0], y - flight.wobble[1], z)
-        flight.position = (x, y, z)
-        self._wobble = flight.wobble
+        _, _, z = motion.held
+        motion.velocity = (target_x, target_y, motion.velocity[2])
+        motion.held = (x - motion.wobble[0], y - motion.wobble[1], z)
+        motion.position = (x, y, z)
+        self._wobble = motion.wobble
 
-    def show(self, motion: Mirrored, step: float) -> None:
-        """Place the body of a mirrored robot, far away while it is absent."""
-        cells, at = self._cells, self._at
-        x, y, _ = motion.position
+
+class _Shown(_Carrier):
+    """Mirrored robot, far away while it is absent; the solver sees its motion from its received pose."""
+
+    def push(self, motion: Motion) -> None:
+        motion.move(self._dt)
+        cells, at, step = self._cells, self._at, self._step
+        x, y, self.height = motion.position
         v_x, v_y, _ = motion.velocity if is_finite(motion.velocity) else (0.0, 0.0, 0.0)
-        if not (math.isfinite(x) and math.isfinite(y)):
+        if not (isfinite(x) and isfinite(y)):
             x, y = AWAY, AWAY
             v_x, v_y = 0.0, 0.0
         cells[at + X], cells[at + Y] = x - step * v_x, y - step * v_y
-        cells[at + YAW] = motion.yaw if math.isfinite(motion.yaw) else 0.0
+        cells[at + YAW] = motion.yaw if isfinite(motion.yaw) else 0.0
         cells[at + V_X], cells[at + V_Y] = v_x, v_y
         cells[at + TURN] = 0.0
+
+    def take(self, _: Motion) -> None:
+        """Nothing: the robot is where it is shown."""
 
 
 def _felt(blow: float, drift: float) -> float:

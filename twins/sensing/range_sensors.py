@@ -43,6 +43,7 @@ class RangeSensors:
     """Range sensors of all robots of a world. Rays of a robot are in the order of its sensors."""
 
     scans: list[RangeScan | None]  # newest readings of each robot; None before the first, and without sensors
+    next: float  # time of the next measurement [s]
 
     def __init__(self, request: BodyRequest, world: World) -> None:
         """Raises BodyError for an unknown sensor."""
@@ -65,7 +66,7 @@ class RangeSensors:
         ]
         self.scans = [None] * len(carried)
         self._due = [-inf] * len(self._mounted)
-        self._next = -inf if self._mounted else inf
+        self.next = -inf if self._mounted else inf
         self._beams: dict[tuple[int, ...], Beams] = {}
 
     def sweep(self, t: float, engine: Engine) -> bool:
@@ -73,7 +74,7 @@ class RangeSensors:
 
         Missed measurements are not repeated.
         """
-        if t < self._next:
+        if t < self.next:
             return False
         due = tuple(k for k, when in enumerate(self._due) if when <= t)
         beams = self._beams.get(due)
@@ -100,7 +101,7 @@ class RangeSensors:
             bearing, elevation = self._rays[row]
             distances = [each for name in self._carried[row] for each in self._seen[row][name]]
             self.scans[row] = RangeScan(t, bearing, elevation, distances)
-        self._next = min(self._due)
+        self.next = min(self._due)
         return True
 
 
