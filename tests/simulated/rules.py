@@ -247,7 +247,7 @@ def picture_of_the_conductor(look: Look, seen: Seen) -> str:
     if view is None or view.status is None or conductor.dead:
         return ""
     well = look.calm and look.linked(conductor) and look.linked(seen.process) and seen.governed
-    well = well and seen.reason != GONE  # a conductor that ends its robots looks no more
+    well = well and seen.reason != GONE and view.left_because != "lost"  # a conductor that ends robots looks no more
     wrong = well and not seen.inside._descent.begun and view.status.phase != Phase(seen.phase).word
     lasted = look.lasting(("view", seen.name), wrong, 3.0)
     return f"is {Phase(seen.phase).word}, the conductor says {view.status.phase} for {lasted:.1f} s" if lasted else ""
