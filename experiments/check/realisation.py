@@ -32,6 +32,9 @@ CLOSE: Final = 1e-2  # rest of a step by conjugate gradients, as a share: the ne
 MIRRORS: Final = 3  # robots on the wrong side that are sought
 MOST_MIRRORED: Final = 40  # robots of a formation in which they are sought: the time grows with the third power
 MOST_SIDES: Final = 4  # neighbours of a robot through which the lines are sought
+TRIES: Final = 20  # fits of places to bearings
+STRICT: Final = 10.0  # weight of what is aside of a bearing
+ASKEW: Final = 0.1  # [rad] bearings written with two digits contradict one another by less
 POINT: Final = 1e-6  # [m] robots that are nearer than this to each other stand in one point, which nothing turns
 
 
@@ -434,6 +437,34 @@ def contradictions(links: Links) -> list[Contradiction]:
             fork = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(way[i], way[j], strict=False)))
             found.append(Contradiction((*reversed(way[i][fork - 1 :]), *way[j][fork:]), k, gap))
     return sorted(found, key=lambda each: len(each.rows))
+
+
+def directions_agree(links: Links) -> bool:
+    """Whether places apart from one another meet every bearing, seen from above, to some degrees.
+
+    A fit of places with at least one metre along each bearing, and nothing aside of it.
+    """
+    assert links.bearing is not None
+    gx, gy = np.nan_to_num(links.bearing[:, :2]).T[:, :, None]
+    rows = np.eye(1 + int(max(links.receiver.max(), links.sender.max())))
+    apart = rows[links.receiver] - rows[links.sender]
+    along, aside = np.hstack([gx * apart, gy * apart]), np.hstack([-gy * apart, gx * apart])
+
+    def rest(place: Array) -> float:
+        return float(((STRICT * aside @ place) ** 2).sum() + (np.maximum(1.0 - along @ place, 0.0) ** 2).sum())
+
+    place, least = np.zeros(along.shape[1]), math.inf
+    for _ in range(TRIES):  # Newton's method: only what is too short along its bearing counts
+        short = along @ place < 1.0
+        wanted = np.concatenate([np.zeros(len(links)), np.ones(int(short.sum()))])
+        step = np.linalg.lstsq(np.vstack([STRICT * aside, along[short]]), wanted)[0] - place
+        while rest(place + step) > least and rest(place + step) > rest(place + step / 2.0):
+            step = step / 2.0
+        place = place + step
+        if rest(place) > 0.999 * least:
+            break
+        least = rest(place)
+    return bool((np.abs(aside @ place) <= ASKEW * (along @ place)).all())
 
 
 def formation_rigidity(

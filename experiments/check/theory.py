@@ -19,7 +19,7 @@ from agents.plugins.laws import Gradient
 from agents.vectors import ZERO
 from experiments.check.analysis import FAR_OFF, Analysis
 from experiments.check.findings import FORGIVEN, Finding, Severity
-from experiments.check.realisation import OFF, Conflict, Shape, best_shape, conflicts, contradictions
+from experiments.check.realisation import OFF, Conflict, Shape, best_shape, conflicts, contradictions, directions_agree
 from experiments.definition.experiment import Formation
 from experiments.definition.formation import law_offsets, unlinked
 from experiments.definition.graph import components, edges, reachable
@@ -135,6 +135,17 @@ def _asked(analysis: Analysis) -> str:
 
 def _in_one_place(analysis: Analysis, shape: Shape) -> Finding:
     """Finding on targets that are met only where robots stand in one another."""
+    links = analysis.asked
+    wants = np.zeros(len(links)) if links.wants is None else links.wants
+    directed = np.flatnonzero(analysis.standing & (wants == BY_BEARING))
+    if len(directed) and not directions_agree(links.take(directed)):  # robots in one point meet any direction
+        away = norm(shape.position[links.receiver] - shape.position[links.sender])
+        at_fault = [k for k in directed if away[k] < OFF] or [*directed]
+        pairs = join_names(list(dict.fromkeys(_pair(analysis, k) for k in at_fault)))
+        message = f"the directions of {pairs} contradict one another: only robots in one point meet them"
+        severity: Severity = "error" if analysis.is_gradient else "warning"
+        remedy = "give directions that one drawing has, or fewer of them"
+        return Finding(severity, "not-realisable", message, remedy, analysis.link_path(int(at_fault[0])))
     names, (first, second) = analysis.plan.names, shape.overlaps[0].tolist()
     apart = float(norm((shape.position[first] - shape.position[second])[:2]))
     more = f", and {len(shape.overlaps) - 1} more like this" if len(shape.overlaps) > 1 else ""

@@ -20,7 +20,7 @@ from experiments.check.analysis import Analysis
 from experiments.check.ideal_run import Prediction
 from experiments.check.motion import formation
 from experiments.check.stability import modes
-from experiments.definition.experiment import Formation, RobotTable
+from experiments.definition.experiment import Formation, LinkTable, RobotTable
 from experiments.definition.formation import law_offsets
 from experiments.definition.graph import Links, links
 from experiments.definition.plan import Plan
@@ -204,6 +204,18 @@ def test_best_shape_keeps_robots_apart():
     assert realisation.best_shape([crossed, far, apart]) is apart
     assert realisation.best_shape([crossed, far]) is crossed
     assert realisation.best_shape([shape(0.5 * realisation.OFF), apart]).worst == 0.5 * realisation.OFF
+
+
+@pytest.mark.parametrize(("last", "agree"), [([1.0, -1.0], True), ([1.0, 1.0], False)])
+def test_directions_that_contradict_are_named(last, agree):
+    robots = {f"K{k}": RobotTable(kind="khepera4", start=[0.5 * k, 0.1 * k]) for k in range(3)}
+    given = {"K0 - K1": [-1.0, 0.0], "K0 - K2": [0.0, -1.0], "K1 - K2": last}
+    drawn = Formation(links={name: LinkTable(bearing=each) for name, each in given.items()}, law="bearing")
+    found = findings(small(robots, formation=drawn, duration_s=5.0))
+    assert ("not-realisable" in found) is not agree
+    if not agree:
+        assert found["not-realisable"].severity == "error"
+        assert "the directions of K0 - K1, K0 - K2, K1 - K2 contradict" in found["not-realisable"].message
 
 
 def test_shape_in_one_place_is_an_error():
