@@ -42,6 +42,13 @@ ROOT = Path(__file__).resolve().parent.parent
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Refuses a path that is not there: the workers of -n collect nothing then, and do not say why."""
+    for name in config.args:
+        if not Path(name.partition("::")[0]).exists():
+            raise pytest.UsageError(f"{name}: there is no such file or folder")
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Refuses two tests for one mechanism: each costs seconds."""
     shown: dict[str, str] = {}

@@ -22,6 +22,13 @@ def test_ctrl_c_reaches_children_of_background_tests():
     assert done.stdout == "True\n"
 
 
+@pytest.mark.slow
+def test_a_path_that_is_not_there_is_named():
+    words = [sys.executable, "-m", "pytest", "-n", "2", "tests/nope.py::test_x"]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (done.returncode, "tests/nope.py::test_x: there is no such file" in done.stderr) == (4, True)
+
+
 @for_each("number, wanted", [(2, 4), (3, 8), (4, 16), (0, 1)])
 def squares(number, wanted, asked):
     asked.append(number)
