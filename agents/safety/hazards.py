@@ -177,9 +177,9 @@ class Hazards:
         self.then = [int(rule.then if kind.flies or rule.grounded is None else rule.grounded) for rule in table]
         self.then_s = [rule.then_s + (0.0 if kind.flies else rule.grounded_s) for rule in table]
         self.clears_s = [rule.clears_s for rule in table]
-        self.repeats = sum(1 << cause for cause in Cause if table[cause].repeats)
-        self.place = sum(1 << cause for cause in Cause if table[cause].place)
-        self.landing = sum(1 << cause for cause in Cause if table[cause].landing)
+        self.repeats = sum(1 << cause for cause, rule in enumerate(table) if rule.repeats)
+        self.place = sum(1 << cause for cause, rule in enumerate(table) if rule.place)
+        self.landing = sum(1 << cause for cause, rule in enumerate(table) if rule.landing)
         # by the number of the cause, or as a set
         self.since = [NEVER] * len(table)  # begin of its presence without a break [s]; infinity: absent
         self.begun = [NEVER] * len(table)  # begin of its hazard [s]; infinity: none

@@ -332,10 +332,12 @@ class Stretches:
         """Phases and plans move on at `t` [s], up to the end of the last one; returns False for what happens rarely."""
         robots, twins = self._flight.robots, self._flight.twin.twins
         self._first = None
-        image.read(part for each in robots for part in (each.lifecycle, each.now, each.now.state, each.landing))
-        moving = [row for row, robot in enumerate(robots) if not robot.is_steady(t)]
-        for robot in (robots[row] for row in moving):
-            life, together = robot.lifecycle, robot.assignment.lands_at == np.inf and not robot.landing.aside
+        image.read(self._members)
+        moving = [member.row for member in self._members if member.moves]
+        lives = [(robots[row], robots[row].lifecycle) for row in moving]
+        image.read(part for robot, life in lives for part in (life, robot.now, robot.now.state, robot.landing))
+        for robot, life in lives:
+            together = robot.assignment.lands_at == np.inf and not robot.landing.aside
             if not (life.climbing or (AIRBORNE <= life.phase < self._last and together)):
                 return False
         for row in moving:
@@ -349,7 +351,7 @@ class Stretches:
             robot.takes_off = robot.lands = False
             image.write([robot, robot.lifecycle, robot.landing, motion])
         if self._itineraries:
-            image.read(robots)
+            image.read(part for row in self._itineraries for part in (robots[row], robots[row].now))
             self._plan(self.tick)
             image.write(self._plans.values())
         return True

@@ -94,9 +94,10 @@ class LinkQueue:
 class Member:
     """Robot with its twin, and the links on which it sends."""
 
-    __slots__ = ("carrier", "robot", "row", "seq", "twin", "ways", "words")
+    __slots__ = ("carrier", "moves", "robot", "row", "seq", "twin", "ways", "words")
 
     row: int
+    moves: bool  # the phase of the robot moves on at this tick
     seq: int  # number of its last transmission
     robot: Robot
     twin: Twin
@@ -108,6 +109,7 @@ class Member:
         """`words`: numbers beside a pose."""
         self.row, self.robot, self.twin, self.carrier = row, robot, twin, carrier
         self.seq, self.ways = 0, []
+        self.moves = False
         self.words = array("d", (nan,)) * words
 
 
@@ -290,8 +292,8 @@ def observe(members: list[Member], t: float) -> bool:
     moves = False
     for member in members:
         member.robot.observe(t)
-        if not member.robot.is_steady(t):
-            moves = True
+        member.moves = not member.robot.is_steady(t)
+        moves = moves or member.moves
     return moves
 
 
