@@ -32,7 +32,7 @@ TO_ORIGIN: Final = 2.0  # gain of an anchor, of that of a link: as the authors' 
 MOST_ROBOTS: Final = 300  # eigenvalues of more take longer than the run
 TINY: Final = 1e-9
 BY_TARGET: Final = (Law.error, Displacement.error, Distance.error)  # errors by the target that a law needs
-AT_ONCE: Final = 2_000_000  # distances of links that are held in memory at once
+AT_ONCE: Final = 10_000  # distances of links that are computed at once: they stay in the processor's cache
 
 
 @dataclass(frozen=True)
@@ -195,38 +195,35 @@ def errors_over_time(law: Law, pattern: Pattern, time: Array, position: Array) -
         time: (T,) since the common start [s].
         position: (T, N, 3) true [m].
     """
-    links = pattern.links
-    if type(law) is Distance and not pattern.changes:
+    links, wants = pattern.links, WANTS.get(law.NEEDS)
+    given = targeted(law, pattern)
+    error = np.full((len(time), len(links)), np.nan)
+    if wants in (BY_DISTANCE, BY_RELATIVE) and type(law).error in BY_TARGET and not pattern.changes:
+        targets = [link.target for link in pattern.one_way]
+        distance = np.where(given, [to.distance for to in targets], np.nan)
+        relative = np.array([to.relative for to in targets]).reshape(-1, 3).T
         step = max(1, AT_ONCE // max(1, len(links)))
-        error = np.empty((len(time), len(links)))
-        for k in range(0, len(time), step):
-            part = position[k : k + step]
-            error[k : k + step] = np.abs(norm(_apart(part, links.receiver, links.sender)) - links.distance)
-    else:
-        error = np.full((len(time), len(links)), np.nan)
-        columns = targeted(law, pattern).nonzero()[0].tolist()
-        apart = _apart(position, links.receiver[columns], links.sender[columns])
-        wants = WANTS.get(law.NEEDS)
-        if wants in (BY_DISTANCE, BY_RELATIVE) and columns and type(law).error in BY_TARGET and not pattern.changes:
-            targets = [pattern.one_way[each].target for each in columns]
+        for part in (slice(k, k + step) for k in range(0, len(time), step)):
+            apart = [_apart(axis, links.receiver, links.sender) for axis in np.moveaxis(position[part], 2, 0)]
             if wants == BY_RELATIVE:
-                apart = apart - np.array([to.relative for to in targets])
-            x, y, z = np.moveaxis(apart, 2, 0)
+                apart = [each - wanted for each, wanted in zip(apart, relative, strict=True)]
+            x, y, z = apart
             length = np.sqrt(x * x + y * y + z * z)  # sums as `agents.vectors.norm` has them
-            wanted = np.array([to.distance for to in targets])
-            error[:, columns] = length if wants == BY_RELATIVE else np.abs(wanted - length)
-        elif columns:
-            for k, (t, row) in enumerate(zip(time.tolist(), apart.tolist(), strict=True)):
-                if k == 0 or pattern.changes:
-                    every = pattern.targets_at(t)
-                    targets = [every[each] for each in columns]
-                error[k, columns] = [abs(law.error(tuple(away), to)) for away, to in zip(row, targets, strict=True)]
+            error[part] = np.abs(distance - length) if wants == BY_DISTANCE else np.where(given, length, np.nan)
+    elif given.any():
+        columns = given.nonzero()[0]
+        rows = _apart(position, links.receiver[columns], links.sender[columns]).tolist()
+        for k, (t, row) in enumerate(zip(time.tolist(), rows, strict=True)):
+            if k == 0 or pattern.changes:
+                every = pattern.targets_at(t)
+                targets = [every[each] for each in columns.tolist()]
+            error[k, columns] = [abs(law.error(tuple(away), to)) for away, to in zip(row, targets, strict=True)]
     present = pattern.present(time, position)
     return error if present is None else np.where(present, error, np.nan)
 
 
 def _apart(position: Array, receiver: Index, sender: Index) -> Array:
-    """Vectors (T, E, 3) [m] from senders to receivers at `position` (T, N, 3) [m]."""
+    """Differences (T, E, ...) from senders to receivers of `position` (T, N, ...)."""
     return np.asarray(position.take(receiver, axis=1) - position.take(sender, axis=1))  # a sixth of the time of indices
 
 
