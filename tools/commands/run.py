@@ -450,7 +450,7 @@ def _case_line(name: str, runs: Sequence[Run], found: dict[str, Any]) -> str:
     linked = case["mean"]["iae"] is not None
     metrics = {each: metric for each, metric in console_metrics(measured).items() if each in mean}
     for each in OURS:
-        if case["mean"].get(each) is None and not (linked and each == "acquired_s"):
+        if case["mean"].get(each) is None and each != "f_hz" and not (linked and each == "acquired_s"):
             metrics.pop(each, None)
     of_law = [each for each in metrics if each.startswith(OF_LAW)]
     for each in of_law[0 if linked else FEW :]:  # measures stand for errors
