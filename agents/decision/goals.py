@@ -63,7 +63,7 @@ class GoalComputer:
         self.goal, self.yaw = UNKNOWN, nan  # decided last [m], and wanted there [rad], NaN for any
         self.offset = ZERO  # offset of the law at the last decision, before it was clamped [m]
         self.error = self.energy = 0.0  # Σ|e| of the links [m] and Σ ½e² [m²], of the last call of `errors`
-        self.judged = False  # True if that call found an active link or an anchor
+        self.judged = False  # True if that call found an active link or an anchor, or took the error of a step
 
     def update_links(self, t: float) -> None:
         """Update the active links at `t` [s] for neighbours that appeared or were lost."""
@@ -170,6 +170,7 @@ class GoalComputer:
         """
         if self.stepping is not None:
             self.error, self.energy = self.stepping.error, nan
+            self.judged = True
             return
         law, predictor = self.law, self.predictor
         total = energy = 0.0

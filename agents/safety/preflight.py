@@ -182,9 +182,10 @@ def rehearse(
     if goals.stepping is not None:
         goals.is_sound(t, position)
     for sender in goals.neighbours.all:
-        if sender.active and goals.stepping is None:
+        if sender.active:
             apart = sender.apart(position, predictor, t)
-            _expect("law", law, "pull", law.pull(apart, sender.link), 3)
+            if goals.stepping is None:
+                _expect("law", law, "pull", law.pull(apart, sender.link), 3)
             _expect("law", law, "error", law.error(apart, sender.link), 1)
     for trigger in (transmitter.asking.trigger, assignment.update):
         if trigger is not None:

@@ -48,6 +48,10 @@ class Bare(Counting, frozen=True):
         return nan
 
 
+class Silent(Counting, frozen=True):
+    def error(self, apart, link): ...
+
+
 class Odd(Counting, frozen=True):
     decides: Callable[[object], object]
 
@@ -115,6 +119,11 @@ def test_what_cannot_be_used_names_the_law():
         stepping = Stepping(given(Odd(lambda _, decides=decides: decides)))
         with pytest.raises(PluginError, match="`step` of the law Odd must give"):
             stepping.step(stepping.view())
+
+
+def test_missing_error_is_found_before_take_off():
+    with pytest.raises(PluginError, match="`error` of the law Silent must give a number, not nothing"):
+        Bench(given(Silent()), ZERO).step(0.2, hear)
 
 
 def test_a_law_that_cannot_begin_is_named():
