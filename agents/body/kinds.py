@@ -78,7 +78,8 @@ class ProtocolTwin:
 
     body: str  # name in the group `zenpark.devices`
     process: str | None = None  # name of the process that the robots of a kind share, if one link carries several
-    position: Literal["body", "external"] = "external"  # source of its position
+    # source of its position; "external": simulated motion capture, and what the robot counts itself is not used
+    position: Literal["body", "external"] = "external"
     device: Mapping[str, object] = field(default_factory=dict, hash=False)  # settings on top of those of the file
 
 
@@ -169,6 +170,8 @@ class Kind:
         ""  # its picture, a `module:function` from a kind to a `experiments.scene.models.Model`; "": by its size
     )
     # hardware
+    # time from the loss of its link to standstill on the floor, at most [s]; infinity: it drives on
+    alone_s: float = 1.0
     bodies: tuple[str, ...] = ()  # names in the group `zenpark.bodies` that drive this kind only
     library: str = ""  # library that those bodies need
     twin: ProtocolTwin | None = None

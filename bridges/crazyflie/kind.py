@@ -52,6 +52,7 @@ CRAZYFLIE: Final = Kind(
     prefix="CF",
     colour="#AA4499",
     mesh="experiments.scene.models:crazyflie",
+    alone_s=8.0,
     bodies=("radio", "usb", "udp"),
     library="cflib",
     twin=ProtocolTwin("crazyflie-twin", "radio0", device={"link": "radio"}),  # several hang on one radio

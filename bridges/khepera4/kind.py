@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import inf
 from typing import Final
 
 from agents.body.kinds import Kind, ProtocolTwin, Sensor, Wheels
@@ -42,6 +43,7 @@ KHEPERA4: Final = Kind(
     prefix="KH",
     colour="#44AA99",
     mesh="experiments.scene.models:khepera",
+    alone_s=inf,
     bodies=("khepera4", "kteam"),
     twin=ProtocolTwin("khepera4-twin"),
     connect="switch it on, start its server, ping its address (docs/khepera4.md)",

@@ -37,6 +37,7 @@ TELLO: Final = Kind(
     prefix="DT",
     colour="#999933",
     mesh="experiments.scene.models:tello",
+    alone_s=25.0,
     bodies=("tello",),
     library="djitellopy",
     twin=ProtocolTwin("tello-twin", "tellos"),  # all of a computer are on one port

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import radians
+from math import inf, radians
 from typing import Final
 
 from agents.body.kinds import Kind, ProtocolTwin, Sensor, Wheels
@@ -38,6 +38,7 @@ TURTLEBOT3: Final = Kind(
     prefix="TB",
     colour="#000000",
     mesh="experiments.scene.models:turtlebot",
+    alone_s=inf,
     bodies=("ros2dds", "rmw"),
     library="rosbags",
     twin=ProtocolTwin("turtlebot3-twin"),

@@ -133,12 +133,15 @@ DEVICES = sorted(name.removesuffix("-twin") for name in registry.names(registry.
 
 @pytest.mark.parametrize("kind", DEVICES)
 def test_every_device_moves_and_stops_as_ordered(kind, preflight):
-    """Of yours too: a turn to the wrong side, or a stop that its firmware doesn't know, is found here."""
+    """Of yours too: a turn to the wrong side, or a stop that its firmware doesn't know, is found here.
+
+    What it does without commands, and the place that it tells, `tests/bridges/test_devices.py` judges.
+    """
     hover = ", hover = 0.8" if KINDS[kind].flies else ""
     text = f'R = {{ kind = "{kind}", start = [0.0, 0.0]{hover} }}'
     (robot,) = preflight(BUSY + text, "--hop", "--stop", "--bodies", "protocol", code=None)
     (moved,) = (robot[name] for name in ("hop", "drive") if name in robot)
-    assert moved["verdict"] == "ok"
+    assert moved["verdict"] == "ok", "{found}; {remedy}".format(**moved)
     assert "after " in robot["stop, motors on"]["found"], robot  # later than is safe, on a busy machine
 
 
