@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
@@ -125,8 +125,11 @@ def floor_of(entry: str) -> int:
 
 
 def test_names_of_classes_stand_once():
-    count = Counter(name for module in modules() for name in statements(module)[1])
-    assert [name for name, times in count.items() if times > 1] == []
+    homes = defaultdict(list)
+    for module in modules():
+        for name in statements(module)[1]:
+            homes[name].append(module)
+    assert {name: found for name, found in homes.items() if len(found) > 1} == {}
 
 
 def test_imports_go_one_way():

@@ -6,17 +6,14 @@ import pytest
 
 from agents.body.device_locks import Claims
 from agents.body.interface import BodyError, refuse
+from agents.body.kinds import KINDS
 from agents.plugins import registry
-from bridges.crazyflie.body import CrazyflieBody
-from bridges.khepera4.body import KheperaBody
 from bridges.khepera4.protocol import PARK_PORT
-from bridges.tello.body import TelloBody
-from bridges.turtlebot3.body import TurtleBot3
 from tests.requests import request
 
 pytestmark = pytest.mark.usefixtures("runtime_folder")
 
-BODIES = {"crazyflie": CrazyflieBody, "khepera4": KheperaBody, "tello": TelloBody, "turtlebot3": TurtleBot3}
+BODIES = {kind.name: registry.load(registry.BODIES, kind.bodies[0]) for kind in KINDS.usable() if kind.bodies}
 RADIO, KHEPERA, TELLO, ROS = "radio://0/80/2M/E7E7E7E701", "khepera4://h", "tello://10.0.0.2", "ros2dds://"
 NO_CRAZYFLIE = r"R0: .* is no Crazyflie's address; write radio://0/80/2M/E7E7E7E701"
 NO_TELLO = r"^R0: .*tello://192\.168\.10\.1"
@@ -115,8 +112,9 @@ def test_body_knows_its_device_by_any_name(word):
 
 def test_every_device_has_two_names():
     registered = registry.registered(registry.BODIES)
-    assert {
+    bodies = {
         name
         for name, (entry, *_) in registered.items()
         if entry.value.startswith("bridges.") and entry.module != "bridges.external"
-    } == NAMES.keys()
+    }
+    assert bodies == NAMES.keys(), f"add a row to NAMES in tests/bridges/test_bodies.py: {bodies - NAMES.keys()}"

@@ -8,6 +8,7 @@ import pytest
 import typer.main
 
 from agents.body.interface import BodyEntry, shared_devices
+from agents.plugins import registry
 from bridges.khepera4.kind import KHEPERA4
 from experiments.check.safety import libraries
 from experiments.definition.plan import Plan
@@ -16,6 +17,7 @@ from tests.cases import mostly_slow
 from tools.main import app, main
 from twins.body import TwinBody
 
+TWINS = ", ".join(name.removesuffix("-twin") for name in registry.names(registry.DEVICES))
 TRIANGLE = (Path(__file__).parents[2] / "experiments" / "catalogue" / "triangle.toml").read_text("utf-8")
 RADIO = 'body = "radio://0/80/2M/E7E7E7E701"\n'
 START = "start = [-0.6, -0.5]"
@@ -85,7 +87,7 @@ COMMANDS = (
     ("world serve triangle.toml", "no robot of this experiment lives in a world", '`body = "world"`'),
     ("router --listen tcp/0.0.0.0:7447", "will not listen on tcp/0.0.0.0:7447", "`./zenpark lab init LAB FILE`"),
     ("router --listen nope", "'nope' is not an endpoint", "write it like tcp/127.0.0.1:7447"),
-    ("twin nope", "there is no such protocol twin", "known: crazyflie, khepera4, tello, turtlebot3"),
+    ("twin nope", "there is no such protocol twin", f"known: {TWINS}"),
     ("export nope", "nope: is no folder of a run", "`./zenpark run` prints the folder"),
     ("install --editable ../mine", "by the script ./zenpark", "in its folder: ./zenpark install --editable ../mine"),
     ("view nope", "nope: holds no recording (.mcap)", "name the folder of a run"),

@@ -12,7 +12,7 @@ from agents.body.interface import BodyState
 from agents.body.kinds import KINDS
 from agents.body.limits import Limits
 from agents.decision.situation import Situation
-from agents.safety.setpoint_filter import FLOOR_M, OUTSIDE_M, SetpointFilter
+from agents.safety.setpoint_filter import FLOOR_M, OUTSIDE_M, SetpointFilter, differ
 from bridges.crazyflie.kind import CRAZYFLIE
 from bridges.khepera4.kind import KHEPERA4
 from bridges.tello.kind import TELLO
@@ -65,6 +65,7 @@ def test_lawful_setpoint_for_whatever_comes(kind, given):
         return
     assert all(map(isfinite, safe))
     assert made.changed == any(abs(a - b) > 1e-9 or isnan(b) for a, b in zip(safe, setpoint, strict=True))
+    assert made.changed or not differ(made._within(setpoint, now), setpoint), "a limit that `_lawful` does not know"
     assert made.not_finite == (not all(abs(each) < 1e6 for each in setpoint))
     speed, velocity = min(kind.speed, LIMITS.speed), safe[:3]
     if kind.takes == "position":
