@@ -238,10 +238,11 @@ def _structs(module: ModuleType, level: int = 2, *, parameters: bool = True) -> 
             continue
         yield f"\n{'#' * level} {'' if parameters else 'Fields of '}{node.name}\n"
         yield f"{ast.get_docstring(node) or ''}\n"
-        yield from ("| field | type | meaning |", "|---|---|---|")
+        yield from ("| field | type | default | meaning |", "|---|---|---|---|")
         for each in fields:
-            text = _comment(each, lines)
-            yield f"| `{ast.unparse(each.target)}` | {_cell(f'`{ast.unparse(each.annotation)}`')} | {_cell(text)} |"
+            name, kind = ast.unparse(each.target), _cell(f"`{ast.unparse(each.annotation)}`")
+            default = _cell(f"`{ast.unparse(each.value)}`") if each.value else "–"
+            yield f"| `{name}` | {kind} | {default} | {_cell(_comment(each, lines))} |"
 
 
 def _comment(node: ast.stmt, lines: Sequence[str]) -> str:
