@@ -253,6 +253,12 @@ class Image:
             if (found := self.places.get(id(thing))) is not None:
                 found[1].store(self, thing, found[2])
 
+    def free(self) -> None:
+        """Forget all objects, since functions that were called back still refer to the image."""
+        self.roots = ()
+        self.places.clear()
+        self.arrays.clear()
+
     def _store(self) -> bool:
         """Write the values of all objects; returns whether there is room for them."""
         self.words = np.zeros(self._size, dtype=np.int64)

@@ -385,6 +385,8 @@ class Stretches:
         """End a stretch: the robots are as after plain ticks; see `Ledger.moves` for what it returns."""
         flight, ledger, k = self._flight, self._ledger, self.tick
         self.read()
+        if self._image is not None:
+            self._image.free()
         self._image = None
         for row, itinerary in self._itineraries.items():
             flight.robots[row].goals.itinerary = itinerary
@@ -395,6 +397,9 @@ class Stretches:
         flight.network.leave(self._ways, ledger, self._before, k * flight.dt)
         flight.note(ledger, self._steps)
         flight.twin.moved_to(k * flight.dt)
+        for member in self._members:
+            member.twin.reserve(0)  # lets go of what was used
+        del self._ledger
         return ledger.moves
 
     def _stored(self, prepared: Prepared, ledger: Ledger) -> Image | None:
