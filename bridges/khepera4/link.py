@@ -158,6 +158,8 @@ class Khepera4Link:
     def drive(self, v: float, turn: float, decided: float) -> None:
         """Drive at v [m/s], ω [rad/s], `decided` on the state of that time [s, `uptime`], for `FRESH_S` from then."""
         if v or turn:
+            if decided < self.halted_since < math.inf:
+                return  # a stop from another thread came after that decision
             self.halted_since = math.inf
         self.setpoint = (v, turn, decided)
 

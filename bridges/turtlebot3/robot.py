@@ -43,9 +43,11 @@ class RepeatedVelocity:
 
     def drive(self, v: float, w: float, now: float) -> None:
         """Drive at v [m/s], ω [rad/s] until the next command, for `FRESH_S` at most."""
-        self._commanded = now
         if v or w:
+            if now < self.halted_since < inf:
+                return  # a stop from another thread came after that decision
             self.halted_since = inf
+        self._commanded = now
         self._change((turtlebot3.whole(v, self._top[0]), turtlebot3.whole(w, self._top[1])), now)
 
     def stale(self, now: float) -> bool:

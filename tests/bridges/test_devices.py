@@ -100,13 +100,25 @@ def judge_way_and_stop(device, endpoint, *mutants):
             assert 0.3 < yaw < math.pi, "a turn to the left"
         driver.run(0.1)
         driver.body.stop([0])
-        driver.body.command([MOVES[parts.kind.takes]])  # that of a tick in which the stop came
         driver.decide = None
         driver.run(SILENT_S + 1.0)
         place, _ = place_and_yaw(twin)
         driver.run(2.0)
         assert place_and_yaw(twin)[0] == pytest.approx(place, abs=0.01), "it goes on after a stop"
         assert place[2] < STANDS_M
+
+
+def judge_late_command(device, endpoint, *mutants):
+    """A stop from another thread, in a tick that has decided on its command."""
+    with moving(device, endpoint, mutants, 0.0) as (parts, twin, driver):
+        driver.body.stop([0])
+        driver.body.command([MOVES[parts.kind.takes]])
+        driver.decide = None
+        before, _ = place_and_yaw(twin)
+        driver.run(1.0)
+        after, _ = place_and_yaw(twin)
+        assert after[2] < STANDS_M
+        assert parts.kind.flies or math.dist(before, after) < 0.03
 
 
 def judge_loss(device, endpoint, *mutants):
@@ -127,6 +139,11 @@ def test_every_device_tells_its_way_and_stops(device, router):
 
 
 @pytest.mark.parametrize("device", [GUIDE, *DEVICES])
+def test_every_device_obeys_no_late_command(device, router):
+    judge_late_command(device, router.endpoint)
+
+
+@pytest.mark.parametrize("device", [GUIDE, *DEVICES])
 def test_every_device_left_alone_ends_as_said(device, router):
     judge_loss(device, router.endpoint)
 
@@ -137,6 +154,7 @@ def test_every_device_left_alone_ends_as_said(device, router):
         (judge_way_and_stop, [MIRRORED]),
         (judge_way_and_stop, [THREEFOLD]),
         (judge_way_and_stop, [STOPPED_ONCE, ENDLESS]),
+        (judge_late_command, [STOPPED_ONCE]),
         (judge_loss, [ENDLESS]),
     ],
 )

@@ -166,7 +166,9 @@ def test_a_stop_that_is_not_answered_is_said():
     link.halt(100.0)
     link.halt(101.0)  # again, by the watchdog
     assert [unanswered(102.0), unanswered(103.0), unanswered(103.0, 0.0)] == [False, True, False]
-    link.drive(0.2, 0.0, 0.0)
+    link.drive(0.2, 0.0, 99.0)
+    assert link.setpoint[:2] == (0.0, 0.0), "decided before the stop"
+    link.drive(0.2, 0.0, 104.0)
     assert not unanswered(110.0, 0.2)
 
 
