@@ -188,4 +188,5 @@ def call(command: typer.Typer, name: str = "zenpark") -> None:
             raise
         _report(f"{place}: {type(error).__name__}: {error}")
         sys.exit(2)
-    sys.exit(code)
+    network = sys.modules.get("agents.network.shutdown")  # not loaded: no session was open
+    (sys.exit if network is None else network.end_process)(code)

@@ -64,7 +64,12 @@ def end(main: Callable[[], int]) -> NoReturn:
     except BaseException:  # noqa: BLE001 - Ctrl-C as well
         traceback.print_exc()
         code, broke = 1, True
-    if broke or any(thread.daemon for thread in threading.enumerate()):
+    end_process(code, at_once=broke)
+
+
+def end_process(code: str | int | None, *, at_once: bool = False) -> NoReturn:
+    """Ends the process with the exit code of a `main`; for `at_once` see `end`."""
+    if at_once or any(thread.daemon for thread in threading.enumerate()):
         if isinstance(code, str):
             print(code, file=sys.stderr)
         for stream in (sys.stdout, sys.stderr):

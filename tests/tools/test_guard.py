@@ -1,11 +1,17 @@
 import os
 import signal
+import sys
+import threading
+from unittest.mock import Mock
 
 import pytest
+import typer
 
+from agents.network import shutdown
 from experiments.recording.version import DIGEST_CHARACTERS, digest, provenance
 from tests.commands import ROOT, python, zenpark
 from tools.guard import PACKAGES, intruders
+from tools.main import call
 
 
 def start(folder, *path):
@@ -78,3 +84,21 @@ def test_a_robot_loads_no_openssl():
         "runpy.run_module('experiments.real_time.processes.robot', run_name='__main__', alter_sys=True)"
     )
     assert python("-c", program).stdout.endswith("openssl: None True\n")
+
+
+def test_command_ends_beside_threads_of_the_network(monkeypatch):
+    """The interpreter would end such a thread inside Zenoh, and the process by SIGABRT after all went well."""
+    app, over = typer.Typer(), threading.Event()
+
+    @app.command()
+    def leaving() -> int:
+        threading.Thread(target=over.wait, daemon=True).start()
+        return 3
+
+    monkeypatch.setattr(sys, "argv", ["zenpark"])
+    ended = Mock(side_effect=SystemExit)
+    monkeypatch.setattr(shutdown.os, "_exit", ended)
+    with pytest.raises(SystemExit):
+        call(app)
+    over.set()
+    ended.assert_called_once_with(3)

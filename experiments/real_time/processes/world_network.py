@@ -83,6 +83,7 @@ class Commands:
         self.lives: dict[str, str] = {}
         self._owners = pubsub.AliveWatch(session, Keys.life(keys.alive("*"), "*"))
         self._stopped = set[str]()  # robots that stay stopped, whatever a process says that missed the stop
+        self._tokens = set[str]()  # tokens of all processes that have owned a name
         self._strangers: set[str] = set()
         self.quiet = [inf] * len(names)  # begin of the silence of each robot; infinity: it needs no command
         self.restart()
@@ -175,7 +176,8 @@ class Commands:
             return
         if self.lives.get(name, life) != life:
             self.done.pop(name, None)
-        if self.lives.get(name) != life:
+        if token not in self._tokens:
+            self._tokens.add(token)
             self._stopped.discard(name)
         self.lives[name] = life
 

@@ -310,6 +310,9 @@ def test_stopped_world_robot_obeys_new_processes_alone():
         assert not flies_after(4), "it was cut off, and is the same"
         own(net, KEYS.alive("F"), "two")
         assert flies_after(5)
+        process._stopped.set()
+        own(net, KEYS.alive("F"), "one")
+        assert not flies_after(6), "both told their names again after a router was lost"
 
 
 def test_world_of_many_robots_knows_name_owners():
