@@ -295,7 +295,7 @@ class Process:
         self.out: list[str] = []
         self.sessions: list[Any] = []
         self.ended = Waiters()
-        self.handlers: dict[int, Any] = {}
+        self.handlers: dict[int, Any] = {signal.SIGINT: signal.default_int_handler}
         self.wall, self.drift, self.late, self.stall = 0.0, 0.0, LATE_S, 0.0
         self.stdin, self.eof, self.readers = bytearray(), False, Waiters()
         self.started, self.paused_at, self.resumed_at = kernel.now, -inf, -inf

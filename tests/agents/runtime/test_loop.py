@@ -2,9 +2,9 @@
 
 import math
 import re
+import threading
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from math import inf
 from typing import ClassVar
 
@@ -47,7 +47,13 @@ def net():
 
 @pytest.fixture
 def on_stage(net, monkeypatch):  # the order matters: else the patch would stay for later tests
-    return partial(Stage, monkeypatch, net)
+    stages = []
+    yield lambda *given, **more: stages.append(Stage(monkeypatch, net, *given, **more)) or stages[-1]
+    for stage in stages:
+        stage.runtime.keeper.ownership.end()
+    for thread in threading.enumerate():  # a question that outlives its network ends a later test
+        if thread.name == "owner of the name":
+            thread.join()
 
 
 @pytest.mark.parametrize(
@@ -83,8 +89,6 @@ def test_standstill_without_router_halts_then_lands(experiment, after_s, on_stag
         return phase == Phase.DONE
 
     stage.run(visit)
-    stage.runtime.keeper.ownership.end()
-    stage.runtime.keeper.ownership._asking.join()
     landed = [at - woke[0] for at, order in stage.orders if order == "land"]
     assert landed[: len(after_s)] == pytest.approx(after_s, abs=0.05)
     assert "no router answers about the owner of its name" in stage.robot.lifecycle.reason
