@@ -157,7 +157,7 @@ def holds(found, planes, speed):
     elif ROUNDING + speed < slowest < inf:  # too quick to flee from: every bound below 0 is kept by the same share
         assert violation(nearest(found, planes), planes) <= ROUNDING
     elif slowest == inf and hypot(*found) < speed - ROUNDING:
-        assert violation(found, planes) <= least_violation(planes) + 2.0 * ROUNDING  # of two bounds that oppose each other
+        assert violation(found, planes) <= least_violation(planes) + 2.0 * ROUNDING  # two opposite bounds
 
 
 @MANY
