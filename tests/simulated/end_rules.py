@@ -180,7 +180,7 @@ def figures_are_true(end: End) -> Iterator[str]:
         for t, position, *_ in end.world.samples.get(name, ()):
             if 0.0 <= t - end.start <= end.duration_s:
                 places.setdefault(t, {})[name] = position
-    if not places:  # of real processes no true motion is known
+    if not places:  # true motions of real processes are unknown
         return
     pairs = [pair for each in places.values() for pair in itertools.combinations(each.items(), 2)]
     closest = min((math.dist(p, q) for (_, p), (_, q) in pairs), default=inf)

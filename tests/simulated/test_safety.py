@@ -218,7 +218,7 @@ def test_router_is_lost_after_its_last_words():
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_slow_loop_misses_its_router_as_soon(seed):
-    """It looked for its router on some of its ticks alone, and held after 2.8 s, or not at all (seed 504632)."""
+    """Slow loops looked for the router on some ticks alone: robots held after 2.8 s, or not at all (seed 504632)."""
     slow, silent = Fault(1.0, "late", "C", 0.05, 9.0), Fault(1.2, "pause", "router", lasts=9.0)
     flight = fly(DRONE, slow, silent, settings=["duration_s=5"], seed=seed)
     held = next(t for t, text in flight.robots["C"].hazards if text.startswith(f"hold: {SILENT}"))
@@ -236,7 +236,7 @@ def test_twin_stands_still_while_its_process_asks(seed):
 
 
 def test_robot_without_an_answer_about_its_owner_lands():
-    """It waited anew before each tick, thus for good."""
+    """A process without an answer waited anew before each tick, thus for good."""
     flight = fly(DRONE, Fault(0.5, "slow", "C", 1500, 60.0), settings=["duration_s=20"], seed=3)
     robot = flight.robots["C"]
     commands = [t for t, _ in robot.commands]

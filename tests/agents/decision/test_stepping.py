@@ -96,7 +96,7 @@ def test_memory_is_kept_where_a_robot_was_due():
             assert bench.robot.words == (("count", stepping.memory["count"]),)
     assert (stepping.memory, stepping.measures) == ({"count": (10.0,), "secret": (1.0, 2.0)}, {"heard": 0.0})
     assert bench.robot.setpoint[0] == pytest.approx(0.05, rel=0.2)
-    assert bench.robot.error == pytest.approx(hypot(0.5, 0.5) - 0.5)  # of the two links that the file gives
+    assert bench.robot.error == pytest.approx(hypot(0.5, 0.5) - 0.5)  # sum over the two links of the file
     assert isnan(running(Bare()).robot.error)
     odd = {"count": (3.0, 4.0), "other": (1.0,)}  # of another size
     bench.step(0.3, lambda bench: hear(bench, odd, {"count": (3.0,)}))

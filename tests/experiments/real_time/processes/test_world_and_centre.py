@@ -299,7 +299,7 @@ def test_stopped_world_robot_obeys_new_processes_alone():
             process._tick(0.1 * seq)
             return bodies.body.engine.motions[0].flying
 
-        process._stopped.set()  # before its process is there
+        process._stopped.set()  # a stop before the robot has a process
         process._tick(0.0)
         own(net, KEYS.alive("F"), "one")
         assert flies_after(1)
