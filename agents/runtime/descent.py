@@ -57,6 +57,7 @@ class Descent:
         self._resigned = False  # no answer came about the owner of the names, and the robots land
         self.airborne = False  # a row flew at the last reading of its body, or took off since
         self.asked_at = -inf  # end of the last wait for the owner of the names, on the clock `uptime` [s]
+        self._silent_at: float | None = None  # first wait since the last command, on the clock of the ticks [s]
         self.reason_to_end: Callable[[], str | None] = lambda: None
         self.stop_s = timing.stop_s  # [s] limit for a body to confirm that its motors are off
         kinds = [robot.assignment.kind for robot in robots]
@@ -80,8 +81,8 @@ class Descent:
 
         While it waits it must not command its bodies, since another process may drive them. Without an answer those on
         wheels halt after `neighbour_timeout_s`. After `offline_s`, or `ANSWER_S` if the process is asked to end, all
-        land. While the answer names another owner, neither happens. The process then drives its bodies again, until it
-        learns that they belong to another one. One that is cut off again holds and lands by its decisions.
+        land, also if it is cut off and linked again meanwhile. While the answer names another owner, neither happens.
+        The process then drives its bodies again, until it learns that they belong to another one.
         """
         ownership, session = self._keeper.ownership, self.session
         if self.watchdog.tripped:  # the watchdog handles a loop that hangs
@@ -90,14 +91,20 @@ class Descent:
         if ownership.check_return(session) or stood:
             ownership.begin(session)
         elif self._keeper.is_owner():
-            self._resigned = False
+            self._resigned, self._silent_at = False, None
             return False
-        elif not ownership.linked or (self._resigned and not ownership.contested):
+        elif not ownership.linked:
+            self._silent_at = None
+            return False
+        elif self._resigned and not ownership.contested:
             return False
         limits, drives = self._limits, self._on_wheels
         began, self._keeper.hands_off = self._ticks.elapsed(), True
+        if self._silent_at is None:
+            self._silent_at = began
         while not self._keeper.is_owner() and (stood or ownership.contested or network.connected(session)):
-            waited = 0.0 if ownership.contested else self._ticks.elapsed() - began  # else the other owner drives them
+            driven = ownership.contested  # the other owner drives the bodies
+            waited = 0.0 if driven else self._ticks.elapsed() - self._silent_at
             if waited > limits.offline_s or (waited > ANSWER_S and self.reason_to_end() is not None):
                 what = "stood still" if stood else "was cut off"
                 self._resigned = True  # its landing needs ticks

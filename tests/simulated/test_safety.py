@@ -247,6 +247,18 @@ def test_robot_without_an_answer_about_its_owner_lands():
     assert flight.violations == []
 
 
+@pytest.mark.parametrize("seed", [3, 4, 5])
+def test_wait_for_an_answer_begins_once(seed):
+    """A link that was lost and came back began the wait anew, without a command in between (seed 811752)."""
+    asleep, slow = Fault(1.0, "pause", "C", lasts=5.0), Fault(5.7, "slow", "C", 1800, 60.0)
+    flight = fly(DRONE, asleep, slow, settings=["duration_s=20"], seed=seed)
+    robot = flight.robots["C"]
+    over = min(t for t, _ in robot.commands if t > 6.0)
+    assert 6.0 + 10.0 < over < 6.0 + 10.1
+    assert robot.entered("landing") == [pytest.approx(over, abs=SOON_S)]
+    assert flight.violations == []
+
+
 SHORTLY_SILENT = Fault(0.5, "pause", "router", lasts=1.5), Fault(0.5, "cut", "A", lasts=1.0)
 
 
