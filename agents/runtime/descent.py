@@ -57,7 +57,7 @@ class Descent:
         self._resigned = False  # no answer came about the owner of the names, and the robots land
         self.airborne = False  # a row flew at the last reading of its body, or took off since
         self.asked_at = -inf  # end of the last wait for the owner of the names, on the clock `uptime` [s]
-        self._silent_at: float | None = None  # first wait since the last command, on the clock of the ticks [s]
+        self._silent_at = inf  # begin of the first such wait since the last command, on the same clock [s]
         self.reason_to_end: Callable[[], str | None] = lambda: None
         self.stop_s = timing.stop_s  # [s] limit for a body to confirm that its motors are off
         kinds = [robot.assignment.kind for robot in robots]
@@ -82,7 +82,8 @@ class Descent:
         While it waits it must not command its bodies, since another process may drive them. Without an answer those on
         wheels halt after `neighbour_timeout_s`. After `offline_s`, or `ANSWER_S` if the process is asked to end, all
         land, also if it is cut off and linked again meanwhile. While the answer names another owner, neither happens.
-        The process then drives its bodies again, until it learns that they belong to another one.
+        The process then drives its bodies again, until it learns that they belong to another one. One that stays cut
+        off holds and lands by its decisions.
         """
         ownership, session = self._keeper.ownership, self.session
         if self.watchdog.tripped:  # the watchdog handles a loop that hangs
@@ -91,20 +92,19 @@ class Descent:
         if ownership.check_return(session) or stood:
             ownership.begin(session)
         elif self._keeper.is_owner():
-            self._resigned, self._silent_at = False, None
+            self._resigned, self._silent_at = False, inf
             return False
         elif not ownership.linked:
-            self._silent_at = None
+            self._silent_at = inf
             return False
         elif self._resigned and not ownership.contested:
             return False
         limits, drives = self._limits, self._on_wheels
         began, self._keeper.hands_off = self._ticks.elapsed(), True
-        if self._silent_at is None:
-            self._silent_at = began
+        self._silent_at = min(self._silent_at, self._ticks.zero + began)
         while not self._keeper.is_owner() and (stood or ownership.contested or network.connected(session)):
-            driven = ownership.contested  # the other owner drives the bodies
-            waited = 0.0 if driven else self._ticks.elapsed() - self._silent_at
+            silent_s = self._ticks.zero + self._ticks.elapsed() - self._silent_at
+            waited = 0.0 if ownership.contested else silent_s  # else the other owner drives them
             if waited > limits.offline_s or (waited > ANSWER_S and self.reason_to_end() is not None):
                 what = "stood still" if stood else "was cut off"
                 self._resigned = True  # its landing needs ticks

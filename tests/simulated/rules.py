@@ -63,7 +63,7 @@ def finite_motion(_: Look, seen: Seen) -> str:
 @rule(OF_ROBOTS, "It holds 1.3 to 1.8 s after the loss")
 def hold_without_router(look: Look, seen: Seen) -> str:
     offline = not look.linked(seen.process, slowly=True) and seen.phase in (AIRBORNE, RUNNING) and seen.governed
-    limit_s = 2.5 if look.spoiled({"hang"}, seen.name) else 2.2  # of a loop that is slow
+    limit_s = 2.5 if look.spoiled({"hang"}, seen.name) else 2.2  # a slow loop notices later
     lasted = look.lasting(("hold", seen.name), offline and seen.prompt, limit_s)
     goes_on = lasted and not seen.hazard.startswith(HELD)
     return f"no router for {lasted:.1f} s, hazard '{seen.hazard}'" if goes_on else ""
@@ -249,7 +249,8 @@ def picture_of_the_conductor(look: Look, seen: Seen) -> str:
         return ""
     well = look.calm and look.linked(conductor) and look.linked(seen.process) and seen.governed
     well = well and seen.reason != GONE and view.left_because != "lost"  # a conductor that ends robots looks no more
-    well = well and not seen.inside._telemetry._resting[seen.row]  # its body does not confirm a stop yet
+    stands = "command" in look.kinds and seen.inside._telemetry._resting[seen.row]  # a paused world confirms no stop
+    well = well and not stands
     wrong = well and not seen.inside._descent.begun and view.status.phase != Phase(seen.phase).word
     lasted = look.lasting(("view", seen.name), wrong, 3.0)
     return f"is {Phase(seen.phase).word}, the conductor says {view.status.phase} for {lasted:.1f} s" if lasted else ""
