@@ -1,10 +1,14 @@
-"""The one way in which tests wait for something, and a clock by hand."""
+"""The one way in which tests wait for something, or take turns, and a clock by hand."""
 
 from __future__ import annotations
 
+import fcntl
+import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 PATIENCE_S = 60.0  # nothing takes so long, on the slowest machine
 
@@ -16,6 +20,14 @@ def until(true: Callable[[], object], what: str = "it is true", limit_s: float =
     while not true():
         assert time.monotonic() < deadline, f"not in {limit_s:g} s: {what}"
         pause.wait(0.005)
+
+
+@contextmanager
+def only_user_of(device: str) -> Iterator[None]:
+    """Inside no other test drives such a device: the ports of a maker's library are the host's."""
+    with (Path(tempfile.gettempdir()) / f"zenpark-{device}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
 
 
 class ManualClock:

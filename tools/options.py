@@ -75,6 +75,12 @@ class ZenparkCommand(TyperCommand):
 class Group(TyperGroup):
     """Commands of one subject; help shows the whole first sentence of each, those of zenpark itself in panels."""
 
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:  # noqa: ANN401 - of typer's private click
+        """Command of the first word; of hidden ones none is suggested for a wrong word."""
+        if args[0] not in self.commands:
+            self.commands = {name: each for name, each in self.commands.items() if not each.hidden}
+        return super().resolve_command(ctx, args)
+
     def get_params(self, ctx: Any) -> list[Any]:  # noqa: ANN401 - of typer's private click
         """Options of the group itself."""
         return _quick(super().get_params(ctx))

@@ -31,7 +31,7 @@ from experiments.file.problems import refusal
 from experiments.metrics.metric import Metric, law_metrics, measures_in, swept_metrics, unusable_metrics
 from experiments.recording.run_folder import RUNS, naming
 from experiments.sweep import table
-from experiments.sweep.plan import Axis, Cell, arguments, cells, seeds_of
+from experiments.sweep.plan import Axis, Cell, arguments, cells, compared, seeds_of
 from experiments.sweep.runs import RunMetrics, code_of, lean_enough
 from experiments.sweep.store import Store, StoreOrigin
 from experiments.sweep.table import CellRow
@@ -116,6 +116,8 @@ def sweep(
     folder = Path(out) if out is not None else folder_of(read, axes, "sweep")
     with naming(folder), Store(folder) as store:
         notes = store.changed_since(origin(read, [cell.plan for cell in plan]))
+        if cases and (first := compared(read)) not in cases:
+            notes.append(f"'{first}' runs as well: ratios are relative to it, the first case of the file")
         with workers(scheduler, processes) as working:
             runner = SweepRunner(store, working, most_seeds)
             with suppress(KeyboardInterrupt):  # what is done is kept
@@ -178,7 +180,8 @@ class SweepRunner:
             known, runs = self._known(cell, seeds), self._runs(cell, seeds)
             if known:
                 reference = self._runs(by_digest[cell.reference], seeds)
-                found.append(table.row(cell, runs, reference, len(known) - len(runs), metrics))
+                failed, missing = len(known) - len(runs), len(seeds) - len(known)
+                found.append(table.row(cell, runs, reference, failed=failed, missing=missing, metrics=metrics))
         return found
 
     def metrics(self, plan: Sequence[Cell], seeds: Sequence[int]) -> dict[str, Metric]:

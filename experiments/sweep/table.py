@@ -38,6 +38,7 @@ class CellRow(msgspec.Struct, frozen=True):
     ratio: dict[str, Spread]
     acquired: float | None  # share of the seeds in which every robot but the leaders acquired
     gap_min_s: float | None  # shortest time between two transmissions of any robot, in all seeds [s]
+    missing: int = 0  # runs that an interruption has left undone
 
     def value(self, index: str) -> Spread:
         """The ratio of a metric if it has one, else its mean; unknown if it was not measured."""
@@ -67,7 +68,9 @@ def row(
     cell: Cell,
     runs: Mapping[int, RunMetrics],
     reference: Mapping[int, RunMetrics],
+    *,
     failed: int = 0,
+    missing: int = 0,
     metrics: Mapping[str, Metric] | None = None,
 ) -> CellRow:
     """A cell's runs, by seed, and those of its reference; some `metrics` instead of those of all sweeps."""
@@ -97,6 +100,7 @@ def row(
         },
         acquired=sum(acquired) / len(acquired) if acquired else None,
         gap_min_s=min(gaps, default=None),
+        missing=missing,
     )
 
 
@@ -118,13 +122,14 @@ def write_csv(path: Path, rows: Sequence[CellRow], metrics: Mapping[str, Metric]
     paths = list(dict.fromkeys(path for each in rows for path in each.parameters))
     columns = [part for name in metrics for part in (name, f"{name}_ci95")]
     columns += [part for name in relative_metrics(metrics) for part in (f"{name}_ratio", f"{name}_ratio_ci95")]
-    head = ["case", *paths, "reference", "seeds", "failed", *columns, "acquired_share", "gap_min_s"]
+    head = ["case", *paths, "reference", "seeds", "failed", "missing", *columns, "acquired_share", "gap_min_s"]
     with path.open("w", newline="", encoding="utf-8") as file:
         table = csv.DictWriter(file, head, restval="")
         table.writeheader()
         for each in rows:
             found: dict[str, Any] = {"case": each.case, **each.parameters}
-            found |= {"reference": int(each.reference), "seeds": each.seeds, "failed": each.failed}
+            found |= {"reference": int(each.reference), "seeds": each.seeds}
+            found |= {"failed": each.failed, "missing": each.missing}
             for suffix, group in (("", each.mean), ("_ratio", each.ratio)):
                 for index, value in group.items():
                     found |= {f"{index}{suffix}": value.mean, f"{index}{suffix}_ci95": value.ci95}
@@ -202,7 +207,8 @@ def text(rows: Sequence[CellRow], metrics: Mapping[str, Metric]) -> list[str]:
     heads = [head for head, _ in shown]
     lines: list[tuple[str, ...]] = [("case", "parameters", "seeds", *heads)]
     for row in rows:
-        seeds = str(row.seeds) + (f" ({row.failed} failed)" if row.failed else "")
+        fewer = [f"{count} {what}" for count, what in ((row.failed, "failed"), (row.missing, "missing")) if count]
+        seeds = str(row.seeds) + (f" ({', '.join(fewer)})" if fewer else "")
         lines.append((row.case, row.words, seeds, *(number(row) for _, number in shown)))
     width = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return [

@@ -1,12 +1,9 @@
 """Every registered device behind its twin, judged by the truth; yours, too. What must fail is put into the guide's."""
 
-import fcntl
 import math
-import tempfile
 import time
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -17,6 +14,7 @@ from tests.agents.plugins.test_plugins_outside import source_of
 from tests.bridges.driver import Driver, constant
 from tests.requests import request
 from tests.twins.loopback import Served, reached
+from tests.waiting import only_user_of
 
 pytestmark = [pytest.mark.system, pytest.mark.usefixtures("runtime_folder")]
 
@@ -73,9 +71,8 @@ def moving(device, endpoint, mutants, silent_for_s):
     parts = Parts(device, mutants)
     silent_from_s = 18.0 if parts.kind.flies else 7.0
     faults = {"silent_from_s": silent_from_s, "silent_for_s": silent_for_s}
-    lock = Path(tempfile.gettempdir()) / f"zenpark-{device}.lock"  # ports of a maker's library are the host's
     with ExitStack() as stack:
-        fcntl.flock(stack.enter_context(lock.open("w")), fcntl.LOCK_EX)
+        stack.enter_context(only_user_of(device))
         twin, made, asked = stack.enter_context(parts.served(endpoint, **faults))
         body = stack.enter_context(closing(made(asked)))
         body.open()

@@ -12,6 +12,7 @@ from experiments.metrics.measure import measure
 from experiments.real_time.hosts.launcher import LAND_S
 from tests.commands import GUARD, started
 from tests.system.lab import NEAR, Flight, assert_formed, gone, until
+from tests.waiting import only_user_of
 
 pytestmark = pytest.mark.system
 
@@ -139,14 +140,16 @@ def test_every_device_moves_and_stops_as_ordered(kind, preflight):
     """
     hover = ", hover = 0.8" if KINDS[kind].flies else ""
     text = f'R = {{ kind = "{kind}", start = [0.0, 0.0]{hover} }}'
-    (robot,) = preflight(BUSY + text, "--hop", "--stop", "--bodies", "protocol", code=None)
+    with only_user_of(kind):
+        (robot,) = preflight(BUSY + text, "--hop", "--stop", "--bodies", "protocol", code=None)
     (moved,) = (robot[name] for name in ("hop", "drive") if name in robot)
     assert moved["verdict"] == "ok", "{found}; {remedy}".format(**moved)
     assert "after " in robot["stop, motors on"]["found"], robot  # later than is safe, on a busy machine
 
 
 def test_drones_hop_through_their_bridges_under_motion_capture(preflight):
-    drone, tello = preflight(BUSY + DRONES, "--hop", "--bodies", "protocol")
+    with only_user_of("tello"):
+        drone, tello = preflight(BUSY + DRONES, "--hop", "--bodies", "protocol")
     assert {drone[name]["verdict"] for name in ("address", "firmware", "battery", "position", "radio", "hop")} == {"ok"}
     assert " V under load" in drone["hop"]["found"]
     assert " ms late" in drone["hop"]["found"]

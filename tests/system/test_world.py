@@ -205,6 +205,7 @@ positioning = "vicon-twin"
 arena.size = [4.0, 4.0, 2.0]
 world = { engine = "pymunk", sensor_noise = 0.0 }
 avoidance = { kind = "barrier", hears = "neighbours" }
+safety = { position_timeout_s = 4.0, land_without_position_s = 4.0 }  # a busy machine holds up the network
 robots.TB01 = { kind = "turtlebot3", body = "turtlebot3-twin", position = "external", start = [0.0, 0.0] }
 robots.KH01 = { kind = "khepera4", body = "world", start = [-0.3, 0.0] }
 [[timeline]]

@@ -58,6 +58,7 @@ COMMANDS = (
     ("run triangle.toml --vitual", "No such option: --vitual", "--virtual"),
     ("run", "Missing argument 'FILE'", "for example: ./zenpark run "),
     ("rum", "No such command 'rum'", "Did you mean 'run'?"),
+    ("start", "No such command 'start'.\n", "`./zenpark --help` shows what there is"),
     ("chek triangle.toml", "No such command 'chek'. Did you mean 'check'?", "--help` shows what there is"),
     ("check -", "-: neither a file nor", "/dev/stdin is the standard input"),
     ("check full", "full: is a folder", "name a file in it: triangle.toml"),

@@ -3,14 +3,11 @@
 `python -m tests.bridges.tello.test_scenarios NAME` runs one.
 """
 
-import fcntl
 import socket
 import subprocess
 import sys
-import tempfile
 import threading
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,6 +20,7 @@ from tests.bridges.driver import Driver, toward
 from tests.conftest import ROOT
 from tests.requests import request
 from tests.twins.loopback import Served, reached
+from tests.waiting import only_user_of
 
 ONE = request("tello", ["tello-twin"], external=True, yaw=0.5)
 NOBODY = "tello://127.0.0.77:18889"
@@ -37,10 +35,8 @@ NOBODY = "tello://127.0.0.77:18889"
     ],
 )
 def test_bridge_flies_twins_by_djitellopy(scenario):
-    """The ports of djitellopy are the host's, so scenarios take turns."""
     command = [sys.executable, "-m", "tests.bridges.tello.test_scenarios", scenario]
-    with (Path(tempfile.gettempdir()) / "zenpark-tello.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+    with only_user_of("tello"):
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=200, check=False)
     assert (done.returncode, done.stderr) == (0, "")
 

@@ -83,12 +83,20 @@ def test_a_sweep_that_was_interrupted_goes_on(done, tmp_path):
             raise KeyboardInterrupt
 
     part, _ = swept(tmp_path, progress=three, most_seeds=2)
-    assert (part.missing, [row.seeds for row in part.rows]) == (5, [2, 2])  # cases take turns
+    assert part.missing == 5
+    assert [(row.seeds, row.missing) for row in part.rows] == [(2, 1), (2, 1)]  # cases take turns
+    assert "2 (1 missing)" in str(part)
     with (tmp_path / "runs.jsonl").open("ab") as file:
         file.write(b'{"cell":"cut off in mid')
     for runs_left in (5, 0):
         whole, ran = swept(tmp_path)
         assert (ran, whole.missing, whole.rows) == (runs_left, 0, done.rows)
+
+
+def test_reference_of_a_named_case_is_announced(done):
+    found, _ = swept(done.folder, cases=["event"])
+    assert [row.case for row in found.rows] == ["periodic", "event", "event"]
+    assert found.notes == ("'periodic' runs as well: ratios are relative to it, the first case of the file",)
 
 
 def test_changed_file_or_version_reruns_affected_runs(tmp_path, monkeypatch):
@@ -179,7 +187,11 @@ def test_the_command_writes_table_figures_and_page(done, capsys):
     given, options = [AXIS, "seeds=3"], {"settings": SHORT, "out": str(done.folder), "processes": 1}
     assert commands.sweep("triangle", given, **options) == 0
     assert "event     threshold=0.02" in capsys.readouterr().out
-    assert (done.folder / "sweep.csv").read_text().startswith("case,trigger.threshold,reference,seeds,failed,f_hz,")
+    assert (
+        (done.folder / "sweep.csv")
+        .read_text()
+        .startswith("case,trigger.threshold,reference,seeds,failed,missing,f_hz,")
+    )
     table = json.loads((done.folder / "sweep.json").read_text())
     assert (table["reference"], table["seeds"], len(table["cells"])) == ("periodic", [1, 2, 3], 3)
     assert table["cells"][2]["ratio"]["iae"]["mean"] == done.rows[2].ratio["iae"].mean
