@@ -221,13 +221,13 @@ class FlightControl:
         self._on_board.clear()
         self._on_board.append(height)
         self.enter(FlightPhase.CLIMBING)  # a stop cuts the motors from here on
+        self._plan_end(self.phase_since + TRIES * REPLY_S + span, height, span)  # its start may be the last that arrives
         trajectories = self.link.trajectories
         answer = self._command_planner(
             trajectories.start_command, lambda: trajectories.start(trajectory), Info.PLANNER_ACTIVE
         )
         replies, _ = self.link.planner_reply(trajectories.start_command)
         self._start_replies = replies + (answer is None)  # an answer that is not here yet may come
-        self._plan_end(uptime() + span, height, span)
         if answer is None or answer == LogStatus.OK:
             return  # a lost answer is no refusal: `update_phase` sees whether it flies
         self.enter(FlightPhase.GROUND)

@@ -16,6 +16,7 @@ from agents.vectors import ZERO
 from bridges.crazyflie import flight as module
 from bridges.crazyflie import pilot
 from bridges.crazyflie.flight import FlightControl, FlightPhase
+from bridges.crazyflie.link import LinkError
 from bridges.crazyflie.protocol import crtp
 from bridges.crazyflie.protocol.addresses import CrazyflieSettings
 from bridges.crazyflie.protocol.crtp import HighLevel, Info, LogStatus, Port
@@ -300,6 +301,24 @@ def test_a_drone_out_of_reach_counts_as_flying(air):
     air.telemetry.info = air.info
     assert not air.flight.resume()
     assert (air.phase, air.flight.trouble) == (FlightPhase.GROUND, "")
+
+
+def test_link_lost_as_a_climb_is_started(air):
+    """Nobody is sent to a drone that may be on its way up."""
+
+    def sleep(seconds):
+        air.now += seconds
+        if air.times("climb"):
+            raise LinkError
+
+    air.flight.enter(FlightPhase.GROUND)
+    air.stand().sleep = sleep
+    with pytest.raises(LinkError):
+        air.flight.takeoff(2.0)
+    for seconds, down in ((0.0, False), (2.0 / module.CLIMB + HOLD_S + 2.0 / SINK, False), (6.0, True)):
+        air.now += seconds
+        assert air.flight.mark_out_of_reach() is down
+        assert ("lands by itself" in air.flight.trouble) is not down
 
 
 def test_unanswered_landing_is_ordered_again(air):
