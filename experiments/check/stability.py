@@ -22,14 +22,15 @@ STEP: Final = 1e-4  # [m] size of the differences that stand for the law's deriv
 STANDING: Final = 1e-6  # modes slower than the fastest by this factor do not move at all
 UNMOVED: Final = 1e-6  # share of the fastest: the law ignores a motion of the whole with a smaller answer
 EVEN: Final = 1e-9  # share of the fastest: a loop that is symmetric up to this has real modes
+TURNING: Final = 0.05  # share of |λ|: a mode with a smaller real part turns, and settles with no gain of any use
 
 
 @dataclass(frozen=True)
 class Modes:
     """The sampled loop near its target."""
 
-    # largest real part of the eigenvalues of H M, what a decision takes from a mode, with the h of robots that bear as
-    # much as those of `bearable`: the loop is unstable from 2
+    # largest |λ|²/Re λ of the eigenvalues of H M, λ itself where it is real: what a decision takes from a mode, with the
+    # h of robots that bear as much as those of `bearable`; the loop is unstable from 2, where |1 − λ| is 1
     gain: float
     radius: float  # largest |1 − λ| of modes that keep their sign: above 1 one of them grows
     slowest_s: float  # time constant of the slowest mode that moves [s]; infinity where none does
@@ -74,7 +75,9 @@ def modes(
     offset = law_offsets(law, position, position[links.sender], links) + anchor_offsets(anchors, position)
     factor = 2.0 / closed if bearable is None else bearable
     hardest = np.sqrt(np.repeat(2.0 / factor[receivers], 2))
-    gain = _eigenvalues(hardest[:, None] * slope * hardest[None, :]).real.max(initial=0.0)
+    every = _eigenvalues(hardest[:, None] * slope * hardest[None, :])
+    settling = every[every.real > TURNING * np.abs(every)]
+    gain = (np.abs(settling) ** 2 / settling.real).max(initial=0.0)
     turned = np.stack([-offset[receivers, 1], offset[receivers, 0]], axis=1).ravel()
     expected = np.stack([0.0 * turned, 0.0 * turned, -root * turned], axis=1)
     led = np.setdiff1d(np.arange(len(position)), receivers)

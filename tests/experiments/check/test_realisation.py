@@ -19,7 +19,7 @@ from experiments.check import realisation
 from experiments.check.analysis import Analysis
 from experiments.check.ideal_run import Prediction
 from experiments.check.motion import formation
-from experiments.check.stability import modes
+from experiments.check.stability import TURNING, modes
 from experiments.definition.experiment import Formation, LinkTable, RobotTable
 from experiments.definition.formation import law_offsets
 from experiments.definition.graph import Links, links
@@ -108,7 +108,25 @@ def test_derivative_by_links_is_that_by_robots(seed, rows):
     net = linked(position, pairs, rng.uniform(0.2, 0.6, len(pairs)).tolist())
     share = rng.uniform(0.05, 0.2, rows)
     found = modes(Distance(), net, position, share, 10.0)
-    assert found.gain == pytest.approx(max(by_hand(net, position, share).real.max(), 0.0), abs=1e-5)
+    values = by_hand(net, position, share)
+    values = values[values.real > TURNING * np.abs(values)]
+    assert found.gain == pytest.approx((np.abs(values) ** 2 / values.real).max(initial=0.0), rel=1e-3, abs=1e-5)
+
+
+@pytest.mark.parametrize("robots", [3, 4, 7])
+def test_one_way_ring_is_unstable_from_one(robots):
+    """Its modes g (1 - exp(i a)) grow from g = 1 on: with three robots by a real part of 1.5."""
+    angle = math.tau * np.arange(robots) / robots
+    place = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+    pairs = [(k, (k + 1) % robots) for k in range(robots)]
+    net = links(pairs, 1.0, 1.0)
+    relative = place[net.receiver] - place[net.sender]
+    net = msgspec.structs.replace(net, relative=relative, wants=np.full(robots, BY_RELATIVE))
+    for step in (0.9, 1.1):
+        found = modes(Displacement(), net, place, np.full(robots, step), 10.0)
+        law = step * (np.eye(robots) - np.roll(np.eye(robots), 1, axis=1))
+        grows = np.abs(1.0 - np.linalg.eigvals(law)).max() > 1.0 + 1e-9
+        assert (found.gain > 2.0) == grows == (step > 1.0)
 
 
 def test_heights_and_lengths_that_make_no_triangle():
