@@ -221,9 +221,8 @@ class FlightControl:
         self._on_board.clear()
         self._on_board.append(height)
         self.enter(FlightPhase.CLIMBING)  # a stop cuts the motors from here on
-        self._plan_end(
-            self.phase_since + TRIES * REPLY_S + span, height, span
-        )  # its start may be the last that arrives
+        latest = self.phase_since + TRIES * REPLY_S  # of its start, which may be the last that arrives
+        self._plan_end(latest + span, height, span)
         trajectories = self.link.trajectories
         answer = self._command_planner(
             trajectories.start_command, lambda: trajectories.start(trajectory), Info.PLANNER_ACTIVE

@@ -29,8 +29,8 @@ TURNING: Final = 0.05  # share of |λ|: a mode with a smaller real part turns, a
 class Modes:
     """The sampled loop near its target."""
 
-    # largest |λ|²/Re λ of the eigenvalues of H M, λ itself where it is real: what a decision takes from a mode, with the
-    # h of robots that bear as much as those of `bearable`; the loop is unstable from 2, where |1 − λ| is 1
+    # largest |λ|²/Re λ of the eigenvalues of H M, what a decision takes from a mode (λ itself where it is real), with
+    # the h of robots that bear as much as those of `bearable`: the loop is unstable from 2, where |1 − λ| is 1
     gain: float
     radius: float  # largest |1 − λ| of modes that keep their sign: above 1 one of them grows
     slowest_s: float  # time constant of the slowest mode that moves [s]; infinity where none does
