@@ -221,7 +221,7 @@ class FlightControl:
         self._on_board.clear()
         self._on_board.append(height)
         self.enter(FlightPhase.CLIMBING)  # a stop cuts the motors from here on
-        latest = self.phase_since + TRIES * REPLY_S  # of its start, which may be the last that arrives
+        latest = self.phase_since + TRIES * REPLY_S  # [s] last start, if it still arrives
         self._plan_end(latest + span, height, span)
         trajectories = self.link.trajectories
         answer = self._command_planner(

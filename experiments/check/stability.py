@@ -14,7 +14,7 @@ from agents.formation.link import Link
 from agents.plugins.laws import Gradient
 from agents.vectors import Vector
 from experiments.check.realisation import whole_motions
-from experiments.definition.formation import Anchored, anchor_offsets, law_offsets, unlinked
+from experiments.definition.formation import Anchored, anchor_offsets, law_offsets, loop_gain, unlinked
 from experiments.definition.graph import Links
 from twins.arrays import Array, Index, norm
 
@@ -22,15 +22,13 @@ STEP: Final = 1e-4  # [m] size of the differences that stand for the law's deriv
 STANDING: Final = 1e-6  # modes slower than the fastest by this factor do not move at all
 UNMOVED: Final = 1e-6  # share of the fastest: the law ignores a motion of the whole with a smaller answer
 EVEN: Final = 1e-9  # share of the fastest: a loop that is symmetric up to this has real modes
-TURNING: Final = 0.05  # share of |λ|: a mode with a smaller real part turns, and settles with no gain of any use
 
 
 @dataclass(frozen=True)
 class Modes:
     """The sampled loop near its target."""
 
-    # largest |λ|²/Re λ of the eigenvalues of H M, what a decision takes from a mode (λ itself where it is real), with
-    # the h of robots that bear as much as those of `bearable`: the loop is unstable from 2, where |1 − λ| is 1
+    # `loop_gain` of H M, what a decision takes from a mode, with the h of robots that bear as much as those of `bearable`
     gain: float
     radius: float  # largest |1 − λ| of modes that keep their sign: above 1 one of them grows
     slowest_s: float  # time constant of the slowest mode that moves [s]; infinity where none does
@@ -75,9 +73,7 @@ def modes(
     offset = law_offsets(law, position, position[links.sender], links) + anchor_offsets(anchors, position)
     factor = 2.0 / closed if bearable is None else bearable
     hardest = np.sqrt(np.repeat(2.0 / factor[receivers], 2))
-    every = _eigenvalues(hardest[:, None] * slope * hardest[None, :])
-    settling = every[every.real > TURNING * np.abs(every)]
-    gain = (np.abs(settling) ** 2 / settling.real).max(initial=0.0)
+    gain = loop_gain(_eigenvalues(hardest[:, None] * slope * hardest[None, :]))
     turned = np.stack([-offset[receivers, 1], offset[receivers, 0]], axis=1).ravel()
     expected = np.stack([0.0 * turned, 0.0 * turned, -root * turned], axis=1)
     led = np.setdiff1d(np.arange(len(position)), receivers)
@@ -90,7 +86,7 @@ def modes(
     moves = lasts < lasts.min(initial=math.inf) / STANDING
     free = len(left) - int((lasts <= within_s).sum()) if math.isfinite(within_s) else 0
     slowest = lasts[moves].max(initial=0.0) or math.inf
-    return Modes(float(gain), float(left[values.real < 1.0].max(initial=0.0)), float(slowest), free)
+    return Modes(gain, float(left[values.real < 1.0].max(initial=0.0)), float(slowest), free)
 
 
 def _eigenvalues(matrix: Array) -> NDArray[np.complex128]:

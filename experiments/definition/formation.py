@@ -9,6 +9,7 @@ from functools import cache, cached_property
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agents.body.kinds import KINDS, Flight, Kind
 from agents.formation import anchors
@@ -26,6 +27,7 @@ Anchored = Sequence[tuple[int, anchors.Anchor]]  # anchors, each with the row of
 
 STEPS_HZ: Final = 100.0  # steps of a drone's model between two decisions
 ROUNDED: Final = 1e-9  # rounding of eigenvalues
+TURNING: Final = 0.05  # share of |λ|
 CALM: Final = 1.15  # gain of the sampled loop, which rings from 1.2 on and is unstable from 2
 BRACED: Final = 1.4  # bound by lengths of links of a braced formation, as a multiple of the gain that directions leave
 TO_ORIGIN: Final = 2.0  # gain of an anchor, of that of a link: as the authors' controllers pull to the origin
@@ -326,7 +328,7 @@ def calm_gain(experiment: Experiment) -> float:
     """Gain μ for a file that gives none: the default, or less where long links would make the loop ring.
 
     The loop takes H M from an error with M at most the Laplacian of the links, each with the weight μ d² of its length
-    from above. Its largest eigenvalue is brought down to `CALM`; in a braced formation links pull in many directions.
+    from above. Its `loop_gain` is brought down to `CALM`; in a braced formation links pull in many directions.
     """
     formation, row = experiment.formation, {name: k for k, name in enumerate(experiment.robots)}
     weight = np.zeros((len(row), len(row)))
@@ -346,4 +348,13 @@ def calm_gain(experiment: Experiment) -> float:
     calm = CALM * (BRACED if int((weight + weight.T > 0.0).sum()) >= 2 * len(row) else 1.0)
     if len(row) > MOST_ROBOTS or not np.isfinite(taken).all():  # rows, without eigenvalues: at most twice as much
         return min(formation.gain, calm / max(2.0 * float(np.nan_to_num(np.diag(taken)).max()), TINY))
-    return min(formation.gain, calm / max(float(np.linalg.eigvals(taken).real.max(initial=0.0)), TINY))
+    return min(formation.gain, calm / max(loop_gain(np.linalg.eigvals(taken)), TINY))
+
+
+def loop_gain(eigenvalues: NDArray[np.complex128]) -> float:
+    """Largest |λ|²/Re λ of the sampled loop p⁺ = (1 − M) p, λ itself where it is real: it is unstable from 2.
+
+    There |1 − λ| is 1. Modes with a real part below `TURNING` turn for ever, and do not count.
+    """
+    settling = eigenvalues[eigenvalues.real > TURNING * np.abs(eigenvalues)]
+    return float((np.abs(settling) ** 2 / settling.real).max(initial=0.0))
