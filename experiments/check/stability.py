@@ -28,7 +28,7 @@ EVEN: Final = 1e-9  # share of the fastest: a loop that is symmetric up to this 
 class Modes:
     """The sampled loop near its target."""
 
-    # `loop_gain` of H M, what a decision takes from a mode, with the h of robots that bear as much as those of `bearable`
+    # `loop_gain` of H M, what a decision takes from a mode, with the h of robots that bear as much as `bearable` says
     gain: float
     radius: float  # largest |1 − λ| of modes that keep their sign: above 1 one of them grows
     slowest_s: float  # time constant of the slowest mode that moves [s]; infinity where none does

@@ -348,7 +348,7 @@ def calm_gain(experiment: Experiment) -> float:
     calm = CALM * (BRACED if int((weight + weight.T > 0.0).sum()) >= 2 * len(row) else 1.0)
     if len(row) > MOST_ROBOTS or not np.isfinite(taken).all():  # rows, without eigenvalues: at most twice as much
         return min(formation.gain, calm / max(2.0 * float(np.nan_to_num(np.diag(taken)).max()), TINY))
-    return min(formation.gain, calm / max(loop_gain(np.linalg.eigvals(taken)), TINY))
+    return min(formation.gain, calm / max(loop_gain(np.linalg.eigvals(taken).astype(complex)), TINY))
 
 
 def loop_gain(eigenvalues: NDArray[np.complex128]) -> float:
