@@ -39,7 +39,7 @@ class RepeatedVelocity:
         self._top = top
         self.halted_since = inf  # infinity while the robot may move
         self._commanded = self._sent_at = self._still_since = -inf
-        self._zeros = ZEROS  # nothing to repeat: nothing is sent before the first command
+        self._zeros = ZEROS  # number of zeros sent; none is due to a robot that stands
 
     def drive(self, v: float, w: float, now: float) -> None:
         """Drive at v [m/s], ω [rad/s] until the next command, for `FRESH_S` at most."""
@@ -78,7 +78,7 @@ class RepeatedVelocity:
             self._change(REST, now)
         velocity = self.velocity
         moving = velocity != REST
-        if not moving and self._zeros >= ZEROS and (self._sent_at == -inf or odometry.standing):
+        if not moving and self._zeros >= ZEROS and odometry.standing:
             return None
         if now - self._sent_at < (BETWEEN_S if velocity != self._sent else REPEAT_S):
             return None

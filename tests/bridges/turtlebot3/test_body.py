@@ -105,14 +105,16 @@ def test_messages_held_back_are_no_restart():
     assert robot.odometry.pose[0] == pytest.approx(0.011 * 39)
 
 
-def test_robot_that_drives_on_gets_zeros():
+@pytest.mark.parametrize("halted_in", [1, None])
+def test_robot_that_drives_on_gets_zeros(halted_in):
+    """Also one that nobody has halted: it drives by the last command of a process that was killed."""
     robot = TurtleBotConnection(request(NOWHERE, "ros2dds://tb3_0?distro=humble"), 0)
     ros = FakeRos(robot)
     for k in range(80):
         t = 0.05 * k
         ros.odometry.append(odometry(ros.types, 0.2 * t, stamp=100.0 + t))
         robot.receive_messages(t, t)
-        robot.halt(t) if k == 1 else robot.send_command(t)
+        robot.halt(t) if k == halted_in else robot.send_command(t)
     assert robot.odometry.speed == pytest.approx((0.2, 0.0), abs=1e-3)
     assert len(ros.sent) > 2 * ZEROS
 
