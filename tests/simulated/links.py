@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 LATENCY_S: Final = 0.0003  # mean time of a message on a link
 FLUSH_S: Final = 0.001  # time from the mending of a cable until what it held arrives
 REORDERED_S: Final = 0.1  # longest delay of a message that others overtake
+LATELY_S: Final = 0.05  # the rules look that often
 REPEATED_S: Final = 0.2  # longest time until the copy of a message arrives
 PUT, DELETE = zenoh.SampleKind.PUT, zenoh.SampleKind.DELETE
 
@@ -154,8 +155,8 @@ class Link:
         return self.near.cut or self.far.cut or self.parted
 
     def arrives(self, node: Node) -> bool:
-        """Whether messages to an end are under way."""
-        return self._due[node] > current().now
+        """Whether messages to an end are under way, or came lately."""
+        return self._due[node] > current().now - LATELY_S
 
     def other(self, node: Node) -> Node:
         return self.far if node is self.near else self.near
@@ -229,5 +230,6 @@ class Link:
         if not self.out:
             for to, held in self._held.items():
                 self._held[to] = []
+                self._due[to] = max(self._due[to], current().now if held else 0.0)
                 for call, args in held:
                     self._arrive(to, call, args)

@@ -94,6 +94,9 @@ ROWS = {
     "recorder_cut_off": Run(
         1, "A: its position was known for 0% of the time only", (Fault(-0.3, "cut", "recorder", lasts=20.0),)
     ),
+    "disk_slow_to_the_end": Run(  # seed 1008094
+        1, "the recorder ended (killed by SIGKILL): messages of the end are", (Fault(1.0, "disk", "recorder", 0.6),)
+    ),
     "disk_full": Run(1, "cannot be written: No space left", (Fault(1.0, "disk", "recorder", "full"),)),
     "stood_still": Run(2, "this process stood still for more than 3 s", frozen("conductor", 5.0)),
     "router_restarted": Run(

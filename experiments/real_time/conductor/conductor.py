@@ -132,11 +132,14 @@ class Conductor(CaseRun):
             self._show(self._progress)
             raise
         finally:
-            self._processes.end()
-            parted = self._processes.join_parts()
+            broken = [self._processes.end(), self._processes.join_parts()]
         lost = tuple(name for name, view in self._robots.items() if view.left_because == "lost")
-        failures = [*([f"lost {', '.join(lost)}"] if lost else []), *self._landings(), *self.failures]
-        failures += [parted] if parted else []
+        failures = [
+            *([f"lost {', '.join(lost)}"] if lost else []),
+            *self._landings(),
+            *self.failures,
+            *filter(None, broken),
+        ]
         landed = [f"{', '.join(names)} {reason} by an operator" for (reason, _), names in self._landed.items()]
         held = [f"{', '.join(sorted(self._held))} held by an operator to the end"] if self._held else []
         halted = "; ".join([*landed, *held])

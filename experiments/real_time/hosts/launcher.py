@@ -67,6 +67,10 @@ class Process:
         return self.handle.poll() is None
 
     @property
+    def killed(self) -> bool:
+        return self.handle.poll() in {None, -signal.SIGKILL}
+
+    @property
     def exit(self) -> str:
         code = self.handle.poll()
         if code is None:
@@ -321,13 +325,12 @@ class Launcher:
         return dead
 
     def end(self, names: Iterable[str], grace_s: float) -> list[Process]:
-        """End processes: end of file on the lifeline, after `grace_s` SIGTERM, then SIGKILL; return those killed."""
+        """End processes: end of file on the lifeline, after `grace_s` SIGTERM, then SIGKILL; return them."""
         with self._lock:
             ending = [self._processes.pop(name) for name in names if name in self._processes]
         for process in ending:
             process.close()
         self._wait(ending, grace_s)
-        stubborn: list[Process] = []
         for number, wait_s in ((signal.SIGTERM, 2.0), (signal.SIGKILL, 2.0)):
             stubborn = [process for process in ending if process.alive]
             for process in stubborn:
@@ -335,7 +338,7 @@ class Launcher:
             self._wait(stubborn, wait_s)
         for process in ending:
             process.forget()
-        return [each for each in ending if each in stubborn or each.handle.returncode == -signal.SIGKILL]
+        return ending
 
     def _forget_zygote(self) -> None:
         if self._zygote is not None:
