@@ -66,6 +66,8 @@ def run(
 ) -> int:
     """Runs a process from its command line; prints errors that are explained, and `more`. Returns the exit code."""
     launch = parse(prog, kind, arguments)
+    if getattr(launch, "lifeline", False):
+        detach()  # a full disk, which takes no output, ends no process of a run
     explained: tuple[type[BaseException], ...] = (ExplainedError, *more)
     try:
         return serve(launch)

@@ -33,8 +33,8 @@ from experiments.file import document
 from experiments.real_time.conductor import conduct, orders, run_view
 from experiments.real_time.conductor import conductor as conducting
 from experiments.real_time.hosts import launcher, run_registry
-from experiments.real_time.processes import joining, world_population
 from experiments.real_time.processes import robot as robot_process
+from experiments.real_time.processes import world_population
 from experiments.recording import version, writer
 from tests.simulated import advanced, bodies, links, processes
 from tests.simulated import kernel as sim
@@ -110,7 +110,7 @@ def _patch_processes() -> None:
     signal.getsignal = lambda number: sim.current().process.handlers.get(int(number), signal.SIG_DFL)
     signal.pthread_sigmask = lambda *_: set()
     sys.stdout = sys.stderr = processes.Output()
-    command_line.detach = joining.detach = lambda: None
+    command_line.detach = lambda: None
     launcher.Launcher.preload, launcher.Launcher.start = lambda _: None, processes.start
     conduct.free_endpoints = lambda count, protocol: [f"{protocol}/127.0.0.1:{7447 + k}" for k in range(count)]
     run_registry.registered, run_registry.tell = processes.registered, processes.tell

@@ -23,7 +23,7 @@ from agents.network.endpoints import DEFAULT_ENDPOINT
 from agents.network.keys import Keys
 from agents.network.name_ownership import NameTaken, OwnershipCheck, claim
 from agents.network.shutdown import closing_cleanly
-from agents.runtime.command_line import detach, on_termination
+from agents.runtime.command_line import on_termination
 from agents.runtime.lifeline import SILENCE_S, Lifeline
 from experiments.definition import mesh
 from experiments.definition.endpoints import router_endpoints
@@ -82,7 +82,6 @@ def joined(
     """
     began, realm = Clock().utc(), plan.experiment.network.realm
     if lost is not None:
-        detach()  # a full disk, which takes no output, ends no process
         Lifeline(lost, on_line=on_line).start()
     with on_termination(on_signal):
         session = network.open_session(endpoints, name=name, stop=stop, rights=mesh.member_rights(plan, endpoints))

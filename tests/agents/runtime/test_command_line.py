@@ -8,12 +8,14 @@ from pathlib import Path
 
 import pytest
 
+from agents.network import session as network
 from agents.network.endpoints import DEFAULT_ENDPOINT, free_endpoint
 from agents.network.lab import LabError
 from agents.network.messages import MAX_WORDS, UNKNOWN, Stop
 from agents.runtime.command_line import NetworkLaunch, Output, interrupts, on_termination, parse
 from agents.runtime.lifeline import LONGEST, Lifeline, LifelineEnd, stop_in, stop_line
 from tests.commands import started
+from tests.waiting import PATIENCE_S
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -149,6 +151,17 @@ def test_stop_passes_the_lifeline_as_a_line():
     assert stop_in(line[:-1]) == Stop("a b", "x" * MAX_WORDS)
     assert stop_in(b"stop {") == Stop(UNKNOWN, "{"), "a stop, whatever follows"
     assert stop_in(b"clock 1") is None
+
+
+@pytest.mark.system
+def test_full_disk_of_a_log_ends_no_router():
+    endpoint = free_endpoint(preferred_port=0)
+    words = ("-m", "agents.runtime.router", "--lifeline", "--listen", endpoint)
+    with Path("/dev/full").open("w") as full, started(*words, stdout=full, stderr=full) as process:
+        with network.open_session([endpoint], name="test", wait_s=PATIENCE_S):
+            assert process.poll() is None
+        process.stdin.close()
+        assert process.wait(PATIENCE_S) == 0
 
 
 @pytest.mark.mechanism("lifeline: the router ends with its starter")
