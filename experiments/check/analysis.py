@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 
 from agents.body.limits import Limits
+from agents.formation.link import BY_BEARING
 from agents.plugins.laws import Gradient
 from agents.plugins.planners import Planner
 from experiments.check.findings import FORGIVEN
@@ -19,6 +20,7 @@ from experiments.check.realisation import (
     Shape,
     Solids,
     best_shape,
+    drawn_bearings,
     find_shapes,
     formation_bend,
     formation_redundancy,
@@ -254,6 +256,11 @@ class Analysis:
                 flipped[:, :2] += (end[anchor] - flipped[anchor]).mean(axis=0)[:2]
                 yield flipped
             yield aloft
+            if links.wants is not None and (links.wants == BY_BEARING).all():
+                drawn, _ = drawn_bearings(links, rows)
+                for size in (1.0, 3.0, 0.3):  # robots that are not linked, or rounded bearings
+                    place = end[anchor, :2].mean(axis=0) + size * (drawn - drawn[anchor].mean(axis=0))
+                    yield np.column_stack([place, aloft[:, 2]])
             for _ in range(min(10, GUESSES // rows)):
                 place = rng.uniform(-0.5, 0.5, (rows, 2)) * experiment.arena.size[:2]
                 yield np.column_stack([place, aloft[:, 2]])

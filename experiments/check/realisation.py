@@ -439,14 +439,11 @@ def contradictions(links: Links) -> list[Contradiction]:
     return sorted(found, key=lambda each: len(each.rows))
 
 
-def directions_agree(links: Links) -> bool:
-    """Whether places apart from one another meet every bearing, seen from above, to some degrees.
-
-    A fit of places with at least one metre along each bearing, and nothing aside of it.
-    """
+def drawn_bearings(links: Links, robots: int) -> tuple[Array, bool]:
+    """Places (N, 2) [m] with at least a metre along each bearing, from above; whether all are met, to some degrees."""
     assert links.bearing is not None
     gx, gy = np.nan_to_num(links.bearing[:, :2]).T[:, :, None]
-    rows = np.eye(1 + int(max(links.receiver.max(), links.sender.max())))
+    rows = np.eye(robots)
     apart = rows[links.receiver] - rows[links.sender]
     along, aside = np.hstack([gx * apart, gy * apart]), np.hstack([-gy * apart, gx * apart])
 
@@ -464,7 +461,7 @@ def directions_agree(links: Links) -> bool:
         if rest(place) > 0.999 * least:
             break
         least = rest(place)
-    return bool((np.abs(aside @ place) <= ASKEW * (along @ place)).all())
+    return place.reshape(2, -1).T, bool((np.abs(aside @ place) <= ASKEW * (along @ place)).all())
 
 
 def formation_rigidity(

@@ -19,7 +19,7 @@ from agents.plugins.laws import Gradient
 from agents.vectors import ZERO
 from experiments.check.analysis import FAR_OFF, Analysis
 from experiments.check.findings import FORGIVEN, Finding, Severity
-from experiments.check.realisation import OFF, Conflict, Shape, best_shape, conflicts, contradictions, directions_agree
+from experiments.check.realisation import OFF, Conflict, Shape, best_shape, conflicts, contradictions, drawn_bearings
 from experiments.definition.experiment import Formation
 from experiments.definition.formation import law_offsets, unlinked
 from experiments.definition.graph import components, edges, reachable
@@ -138,7 +138,8 @@ def _in_one_place(analysis: Analysis, shape: Shape) -> Finding:
     links = analysis.asked
     wants = np.zeros(len(links)) if links.wants is None else links.wants
     directed = np.flatnonzero(analysis.standing & (wants == BY_BEARING))
-    if len(directed) and not directions_agree(links.take(directed)):  # robots in one point meet any direction
+    # robots in one point meet any direction
+    if len(directed) and not drawn_bearings(links.take(directed), len(shape.position))[1]:
         away = norm(shape.position[links.receiver] - shape.position[links.sender])
         at_fault = [k for k in directed if away[k] < OFF] or [*directed]
         pairs = join_names(list(dict.fromkeys(_pair(analysis, k) for k in at_fault)))

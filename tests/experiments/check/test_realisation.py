@@ -234,6 +234,23 @@ def test_directions_that_contradict_are_named(last, agree):
         assert "the directions of K0 - K1, K0 - K2, K1 - K2 contradict" in found["not-realisable"].message
 
 
+STARTS = [(-0.17, -0.97), (0.73, -0.76), (0.85, -1.1), (-0.37, 0.29), (-1.15, 0.9)]
+CHAIN = {"K0 - K1": (-0.155, 0.988), "K1 - K2": (-0.79, 0.613), "K2 - K3": (0.708, -0.706), "K3 - K4": (-0.345, 0.939)}
+NET = {
+    "K0 - K1": (-0.749, -0.662), "K1 - K2": (0.265, 0.964), "K0 - K3": (-0.853, -0.522), "K1 - K3": (-1.0, -0.022),
+    "K2 - K3": (-0.685, -0.729), "K0 - K4": (0.813, 0.582), "K1 - K4": (0.766, 0.643), "K3 - K4": (0.845, 0.535),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("given", [CHAIN, NET], ids=["two that are not linked", "rounded"])
+def test_bearings_of_a_drawing_are_realisable(given):
+    """Guesses in which robots met in one point were all that was tried."""
+    robots = {f"K{k}": RobotTable(kind="khepera4", start=list(start)) for k, start in enumerate(STARTS)}
+    drawn = Formation(links={name: LinkTable(bearing=list(each)) for name, each in given.items()}, law="bearing")
+    found = findings(small(robots, formation=drawn, duration_s=5.0))
+    assert {"realisable", "in-one-place", "not-realisable"} & found.keys() == {"realisable"}
+
+
 def test_shape_in_one_place_is_an_error():
     """A square of four links and a diagonal of nothing: two corners are to be in one place."""
     robots = {f"K{k}": RobotTable(kind="khepera4", start=[0.5 * k, 0.1 * k]) for k in range(4)}
