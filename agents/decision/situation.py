@@ -26,10 +26,19 @@ class ProcessHealth:
     resumed_at: float = -inf  # end of the last suspension [s]
     suspended_s: float = 0.0  # its duration [s]
     connected_since: float = -inf  # begin of the connection to a router after it [s]
+    asked_since: float = (
+        inf  # begin of the wait for the owner of the names, until the tick after it [s]; infinity: none
+    )
+    contested: bool = False  # another owner was seen in that wait
 
     def mark_resumed(self, t: float, slept: float) -> None:
         """The process resumed at `t` [s] after a suspension of `slept` [s]."""
         self.resumed_at, self.suspended_s, self.connected_since = t, slept, t
+
+    def mark_asked(self, since: float, contested: bool) -> None:
+        """The process has waited since `since` [s] for the owner of its names, maybe twice since the last tick."""
+        self.contested = contested or (self.contested and self.asked_since < inf)
+        self.asked_since = min(self.asked_since, since)
 
     def just_resumed(self, t: float) -> bool:
         """Whether poses missed in a suspension may still be on their way at `t` [s]; call it on every tick."""

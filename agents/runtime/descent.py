@@ -19,6 +19,7 @@ from agents.network.name_ownership import ANSWER_S, NameKeeper
 from agents.network.shutdown import FAREWELL_S, STOPPED_S
 from agents.robot import Robot
 from agents.runtime.watchdog import AGAIN_S, DOWN_S, Watchdog
+from agents.safety.hazards import Cause
 from agents.ticks import Ticks
 from agents.vectors import NO_SETPOINT
 
@@ -101,9 +102,11 @@ class Descent:
             return False
         limits, drives = self._limits, self._on_wheels
         began, self._keeper.hands_off = self._ticks.elapsed(), True
+        contested = False
         self._silent_at = min(self._silent_at, self._ticks.zero + began)
         while not self._keeper.is_owner() and (stood or ownership.contested or network.connected(session)):
             silent_s = self._ticks.zero + self._ticks.elapsed() - self._silent_at
+            contested |= ownership.contested
             waited = 0.0 if ownership.contested else silent_s  # else the other owner drives them
             if waited > limits.offline_s or (waited > ANSWER_S and self.reason_to_end() is not None):
                 what = "stood still" if stood else "was cut off"
@@ -119,6 +122,9 @@ class Descent:
         self._keeper.hands_off = False
         over = self._ticks.elapsed()
         self.asked_at = self._ticks.zero + over
+        self._robots[0].health.mark_asked(began, contested)
+        for robot in self._robots:
+            robot.hazards.since[Cause.OWNER] = robot.health.asked_since
         if not stood:  # the machine missed no deadline
             self.leave_out(int((over - began) / self._ticks.period))
         return True

@@ -361,6 +361,7 @@ class Runtime:
 
     def _act(self, setpoints: Sequence[Setpoint], *, ordered: bool) -> None:
         """Commands the body, motors-off first; `ordered`: some robot stops, lands or takes off."""
+        self.health.asked_since = inf  # noted
         stale = self._descent.await_ownership()
         overruled = self._cut_off or self.watchdog.tripped  # another thread has ordered the body to stop or to land
         if ordered:

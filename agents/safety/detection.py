@@ -170,6 +170,7 @@ class Detector:
             health.offline_since < inf
             or health.conductor_lost_since < inf
             or health.missed_share > LATE_SHARE
+            or health.asked_since < inf
             or t < health.connected_since + SILENT_S
         ):
             found |= self.of_process(t, status, neighbours, health)
@@ -248,6 +249,8 @@ class Detector:
                 found |= 1 << Cause.UNSTARTED
         if health.missed_share > LATE_SHARE:
             found |= 1 << Cause.LATE
+        if health.asked_since < inf:
+            found |= 1 << Cause.OWNER
         return found
 
     def of_motion(self, now: Situation, status: RobotStatus, squared: float) -> int:
@@ -425,6 +428,9 @@ class Detector:
                 "motion capture point along its nose?"
             ),
             Cause.UNSTARTED: lambda: f"the conductor is gone for {t - health.conductor_lost_since:.1f} s",
+            Cause.OWNER: lambda: (
+                f"for {t - health.asked_since:.1f} s{'; another process had it, too' * health.contested}"
+            ),
         }
         return extents[cause]()
 

@@ -110,6 +110,7 @@ class Cause(IntEnum):
     # by positions that are wrong it flies away, in the air or in a landing: it falls from some decimetres instead
     STUCK = Rule("its measured height does not follow its climb", Outcome.CUT)
     TURNED = Rule("it flies beside its commands", Outcome.CUT, after_s=0.3)
+    OWNER = Rule("it asked who owns its name", Outcome.HOLD, place=False, landing=True)  # noted afterwards
 
 
 _LOST: Final[Mapping[str, Outcome]] = {

@@ -44,7 +44,7 @@ HELD: Final = 0.2  # share of the time for which a robot may be held
 LAST_S: Final = 0.5  # longest time between the last sample of a whole recording and the order to land [s]
 NAMED_S: Final = 0.05  # [s] shorter holds are not named
 # causes of holds that are not part of an experiment
-HOLDING: Final = (Cause.ORDERED, Cause.POSITION, Cause.ROUTER, Cause.CENTRE, Cause.SUSPENDED)
+HOLDING: Final = (Cause.ORDERED, Cause.POSITION, Cause.ROUTER, Cause.CENTRE, Cause.SUSPENDED, Cause.OWNER)
 CHANGES: Final = {"remove": "removed", "restart": "restarted", "replace": "replaced"}  # orders to the conductor
 ENDED: Final = (
     "silent",

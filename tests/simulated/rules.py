@@ -385,7 +385,7 @@ class Rules:
         assert look.world.plan is not None
         if 0.0 <= look.now - start <= look.world.plan.experiment.duration_s and seen.phase == RUNNING:
             look.ran_s[seen.name] = look.ran_s.get(seen.name, 0.0) + LOOK_S
-            if seen.held and seen.governed:  # else it stands without an order
+            if seen.held or not seen.governed:
                 look.held_s[seen.name] = look.held_s.get(seen.name, 0.0) + LOOK_S
 
     def _use(self, rules: list[Rule], name: str, process: Process) -> None:

@@ -109,6 +109,12 @@ ROWS = {
         CENTRE,
     ),
     "stood": Run(3, "A, B stood for up to 1.", (*frozen("conductor", 1.2), KILLED), (*CENTRE, "duration_s=4")),
+    "asks_for_its_owner": Run(  # seed 817399
+        0,
+        "B held for 0.7 of 4 s: no connection to a router, it asked who owns its name.",
+        (Fault(0.5, "cut", "B", lasts=1.0), Fault(1.0, "slow", "B", 1000, 0.8)),
+        ("duration_s=4",),
+    ),
     "criterion_met": Run(0, "Passed: 1 of 1", experiment=PAIR + LIMIT.format(11)),
     "criterion_not_met": Run(1, "Few messages are wanted.", experiment=PAIR + LIMIT.format(9)),
     "unknown_key": Run(2, "durations", settings=("durations=3",)),

@@ -265,11 +265,20 @@ SHORTLY_SILENT = Fault(0.5, "pause", "router", lasts=1.5), Fault(0.5, "cut", "A"
 @pytest.mark.parametrize("fault", SHORTLY_SILENT, ids=str)
 def test_robot_asks_for_its_owner_before_anything_else(fault):
     """The link outlives both."""
-    flight = fly(TRIO, fault)
+    flight = fly(TRIO, fault, settings=["duration_s=5"])
     back = fault.at + fault.lasts
     sent = [t for t, _ in (*flight.robots["A"].poses, *flight.robots["A"].commands) if t > back + TICK_S]
     assert back + 0.2 < min(sent) < back + 0.2 + 0.15
     assert (flight.code, flight.violations) == (0, [])
+
+
+def test_robot_tells_that_another_process_had_its_name():
+    cut, killed = Fault(0.5, "cut", "A", lasts=4.0), Fault(5.5, "kill", "second A")
+    flight = fly(TRIO, cut, Fault(1.0, "twice", "A"), killed, settings=["duration_s=9"])
+    (asked,) = flight.happened("hazard", "A", "hold: it asked who owns its name: for 1.2 s; another process had it")
+    assert asked.t == pytest.approx(killed.at + 0.2, abs=0.1)
+    assert max(t for t, _ in flight.robots["A"].commands) > 9.0
+    assert (flight.code, flight.violations) == (3, [])
 
 
 @pytest.mark.parametrize("seed", mostly_slow([1, 2], 2))

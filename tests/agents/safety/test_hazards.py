@@ -46,7 +46,7 @@ WHILE_IT_LASTS = {  # of a drone: outcomes, and the ticks at which they begin, o
     ((50, "WARN"),): "CLOCK UNREACHABLE",
     ((100, "WARN"),): "FOREIGN",
     ((200, "WARN"),): "CONDUCTOR HOVERING",
-    ((0, "HOLD"),): "ORDERED SEPARATION ALONE CENTRE SUSPENDED UNSEEING",
+    ((0, "HOLD"),): "ORDERED SEPARATION ALONE CENTRE SUSPENDED UNSEEING OWNER",
     ((0, "HOLD"), (30, "LAND")): "POSITION",
     ((0, "HOLD"), (50, "LAND")): "SETPOINT",
     ((0, "HOLD"), (500, "LAND")): "LATE",
@@ -150,7 +150,7 @@ def test_hazards_on_the_ground_and_while_landing():
     bench.see(30.0, *Cause, active=False, landing=True)
     warned = {Cause.BELOW, Cause.UNREACHABLE, Cause.HOVERING}
     cut = {Cause.FAR_OUTSIDE, Cause.TILT, Cause.LANDING}
-    assert {each.cause for each in bench.hazards.incidents} == warned | cut
+    assert {each.cause for each in bench.hazards.incidents} == warned | cut | {Cause.OWNER}
     assert {each.outcome for each in bench.hazards.incidents if each.cause in cut} == {Outcome.CUT}
 
 
