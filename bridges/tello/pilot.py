@@ -200,9 +200,11 @@ class TelloPilot:
             self._send_sticks(now, last_read)
 
     def _watch_rest(self, now: float) -> None:
-        """Enter SDK mode; land a drone that flies all the same."""
-        if self.silent(now) and now - self._sent_at >= SDK_RETRY_S:
+        """Enter SDK mode; stop and land a drone that flies all the same, such as one of a process that was killed."""
+        unheard = self._sent_at == -math.inf or self.silent(now)
+        if unheard and now - self._sent_at >= SDK_RETRY_S:
             self._send_and_await("command", now)
+            self._rest_sticks()
         elif self._rested >= UNORDERED and self._height >= LOW:
             self.trouble = "landing: it flew without an order"
             self._begin(Duty.LAND, "land", now)

@@ -267,6 +267,13 @@ def test_drone_that_flies_unordered_is_landed(grounded):
     assert grounded.note == "landing: it flew without an order"
 
 
+def test_sticks_of_a_killed_process_are_centred_first(grounded):
+    """The drone keeps them, and sends its state to whoever comes."""
+    grounded.state = {**grounded.report, "h": 80}
+    grounded.pass_(0.05)
+    assert (grounded.said, grounded.sticks) == (["command"], [(0, 0, 0, 0)])
+
+
 def test_refused_sticks_are_counted(airborne):
     assert airborne.answer(b"error", b"error Not joystick").note == ""
     assert airborne.answer(b"error Not joystick").note == "refuses the sticks, 3 times: 'error Not joystick'"
