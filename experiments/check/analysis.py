@@ -168,8 +168,11 @@ class Analysis:
 
     @cached_property
     def rigidity(self) -> tuple[Rigidity | None, Rigidity | None]:
-        """With heights held, and in full space; None without a shape, in space with other targets than distances."""
-        if self.shape is None:
+        """With heights held, and in full space; None without a shape, in space with other targets than distances.
+
+        A shape with robots in one another says nothing of the one that is asked for.
+        """
+        if self.shape is None or len(self.shape.overlaps):
             return None, None
         anchors = self.plan.anchors_by_row
         return formation_rigidity(self.shape.position, self.first_links, self.without_neighbours, anchors)

@@ -169,23 +169,25 @@ class Inspector(CaseRun):
         """Hop or drive, then stop in motion, of one robot; what is red is not moved."""
         robot, asked = self._processes.robot(name), self._trials
         safety = self._experiment.safety
-        trials: list[tuple[str, str, bool, Callable[[], Check]]] = [
-            (checks.hop_of(robot), "hop", asked.hop, lambda: checks.hop(each, self._move(name, robot), safety)),
+        trials: list[tuple[str, str, bool, Callable[[], Tried], Callable[[Tried], Check]]] = [
+            (checks.hop_of(robot), "hop", asked.hop,
+             lambda: self._move(name, robot), lambda tried: checks.hop(each, tried, safety)),
             ("stop, motors on", "stop", asked.stop,
-             lambda: checks.stop_in_motion(each, self._move(name, robot, stop=True))),
+             lambda: self._move(name, robot, stop=True), partial(checks.stop_in_motion, each)),
         ]  # fmt: skip
         own = KINDS[robot.kind].trial
         if own is not None:  # first: the other flights are steered by what it measures
-            tries = partial(checks.trial, own, each)
-            trials.insert(0, (own.name, own.name, asked.own, lambda: tries(self._own_trial(name, own))))
-        for check, option, wanted, judge in trials:
+            judged = partial(checks.trial, own, each)
+            trials.insert(0, (own.name, own.name, asked.own, lambda: self._own_trial(name, own), judged))
+        for check, option, wanted, attempt, judge in trials:
             why = "" if wanted else f"--{option} tries it"
             if wanted and (red or self._context.ended()):
                 why = f"not tried: {self._end or 'mend that first'}"
             if not why:
                 self._phase(f"{name}: {check}")
-                made = judge()
-                why = f"{self._end}; {self._at_end(name)}" if self._end else ""
+                tried = attempt()
+                made = judge(tried)
+                why = f"{self._end}; {self._at_end(name)}" if self._end and not tried.over else ""
                 red = made.verdict == "bad"
             yield Check(check, "unknown", why) if why else made
 
@@ -217,6 +219,7 @@ class Inspector(CaseRun):
                 else:
                     self._fly(name, robot, tried, hold_s)
         finally:
+            tried.over = tried.over or not self._end
             self._processes.end_robots()  # lands it, whatever has happened
         return tried
 
@@ -255,7 +258,7 @@ class Inspector(CaseRun):
             side, limit = checks.aside(tried.states), checks.hop_limit(robot)
             if robot.hover is None or side <= limit:
                 return False
-            outside = math.isfinite(latest_s(robot))
+            tried.over, outside = not self._end, math.isfinite(latest_s(robot))
             self._order(name, messages.Order("stop" if outside else "land"))
             tried.failure = f"{side:.2f} m to the side (limit {limit:g} m): {'stopped' if outside else 'landed'} there"
             return True

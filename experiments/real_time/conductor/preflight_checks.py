@@ -97,6 +97,7 @@ class Tried:
     """Result of a hop, a drive or a stop."""
 
     failure: str = ""  # why it could not be tried, or what went wrong on the way
+    over: bool = False  # it was over before the user, or an emergency stop, ended the checks
     stopped_s: float = math.nan  # time from the order to motors off
     states: list[messages.State] = field(default_factory=list)  # states since the order to move, or since that to stop
     volts: float | None = None  # lowest

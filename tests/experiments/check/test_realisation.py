@@ -229,6 +229,7 @@ def test_directions_that_contradict_are_named(last, agree):
     drawn = Formation(links={name: LinkTable(bearing=each) for name, each in given.items()}, law="bearing")
     found = findings(small(robots, formation=drawn, duration_s=5.0))
     assert ("not-realisable" in found) is not agree
+    assert ("rigid" in found) is agree
     if not agree:
         assert found["not-realisable"].severity == "error"
         assert "the directions of K0 - K1, K0 - K2, K1 - K2 contradict" in found["not-realisable"].message

@@ -303,6 +303,26 @@ def test_interrupt_before_a_trial_moves_nothing(at, given):
     assert [order for order in trying.given if order != "inspect"] == given
 
 
+@pytest.mark.parametrize(
+    ("at", "verdict", "found"),
+    [
+        ("airborne", "unknown", "interrupted; look at it: it is landing"),
+        ("never", "bad", "its position was not known"),
+    ],
+)
+def test_end_behind_a_trial_hides_no_bad_verdict(at, verdict, found):
+    """The user interrupts in the middle of a drive, or while its robot is ended."""
+    trying = Trying(at)
+    trying._context.ended = lambda: trying._robots["KH01"].phase in (at, "landing")
+    trying._processes = SimpleNamespace(
+        adopted=(), start=lambda *_: None, robot=lambda _: WHEELS, end_robots=lambda: trying._enter("landing")
+    )
+    trying._progress, trying._show = SimpleNamespace(phase=""), lambda _: None
+    trying._view.report = lambda *_: None
+    made = next(iter(trying._try("KH01", observed_still(WHEELS), red=False)))
+    assert (made.verdict, made.found) == (verdict, found)
+
+
 class Hopping(Trying):
     """Checks of a drone that goes aside in its hop, at x [m]."""
 
