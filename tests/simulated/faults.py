@@ -25,7 +25,8 @@ class Fault:
     |---|---|---|
     | pause, kill, term | process | |
     | cut | process | the cable of its network is out |
-    | split | processes | nothing passes between them and all others; "second": those that are started by hand |
+    | split | processes | nothing passes between them and all others; "second": those that are started by hand; "ssh": \
+no lifeline either |
     | loss, duplicate, reorder | process | share of its messages that may be dropped |
     | slow | process | factor of its delays; 1 is 0.3 ms |
     | late | process | mean lateness of its sleeps [s] |
@@ -102,7 +103,7 @@ def _split(world: World, fault: Fault) -> None:
         if network.beyond is beyond:  # no later split is there
             network.split(None)
 
-    network.split(beyond)
+    network.split(beyond, lifelines="ssh" in words)
     world.after(fault.lasts, heal)
 
 

@@ -16,7 +16,7 @@ from typing import Any, Final, Self
 import zenoh
 
 from tests.simulated.entities import Left, Publisher, Query, Replies, Subscriber, Token
-from tests.simulated.kernel import Task, block, current, preempt
+from tests.simulated.kernel import Process, Task, block, current, preempt
 from tests.simulated.links import DELETE, LATENCY_S, PUT, Link, Node, Sample, match
 
 SHAKE_S: Final = 0.003  # time to open a link
@@ -49,6 +49,7 @@ class Network:
         self.forgets = 0.0
         self.beyond: Callable[[str], bool] = _nobody
         self.healed = -inf
+        self.lifelines_cut = False
 
     def open(self, config: zenoh.Config) -> Session | Router:
         """A node with settings of `agents.network.zenoh_config`; raises ZError if no router answers."""
@@ -65,14 +66,21 @@ class Network:
         node.cut = cut
         node.suspend()
 
-    def split(self, beyond: Callable[[str], bool] | None) -> None:
-        """Let nothing pass between processes that are `beyond`, by their names, and all others; None: it heals."""
+    def split(self, beyond: Callable[[str], bool] | None, *, lifelines: bool = False) -> None:
+        """Let nothing pass between processes that are `beyond`, by their names, and all others; None: it heals.
+
+        `lifelines` go through it as well, as those of ssh do.
+        """
         if beyond is None:
             self.healed = current().now
-        self.beyond = beyond or _nobody
+        self.beyond, self.lifelines_cut = beyond or _nobody, lifelines
         for link in {id(link): link for node in (*self.sessions, *self.routers) for link in node.links}.values():
             link.parted = self.parts(link.near, link.far)
             link.look()
+
+    def cuts_lifeline(self, one: Process, other: Process) -> bool:
+        """Whether a split cuts the lifeline between two processes."""
+        return self.lifelines_cut and self.beyond(one.name) != self.beyond(other.name)
 
     def parts(self, one: Node, other: Node) -> bool:
         """Whether a split is between two nodes."""

@@ -15,6 +15,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from agents.network import messages
+from agents.runtime.lifeline import BEAT_S
 from experiments.real_time.hosts import launcher, run_registry
 from tests.simulated import kernel as sim
 from tests.simulated.world import current, main, running
@@ -29,28 +30,42 @@ class Handle:
 
     def __init__(self, process: sim.Process) -> None:
         self.process, self.pid = process, process.pid
+        self.starter = sim.current().process
+        self.ssh_killed = False  # the process goes on without its end here
+
+    @property
+    def apart(self) -> bool:
+        """Whether a split cuts the lifeline."""
+        return self.starter is not None and current().network.cuts_lifeline(self.starter, self.process)
 
     @property
     def returncode(self) -> int | None:
         return self.poll()
 
     def poll(self) -> int | None:
-        return self.process.code if self.process.dead else None
+        if self.ssh_killed:
+            return -signal.SIGKILL
+        return self.process.code if self.process.dead and not self.apart else None
 
     def wait(self, timeout: float | None = None) -> int:
-        if not self.process.dead:
-            self.process.ended.wait(timeout)
-        if not self.process.dead:
+        if self.poll() is None:
+            sim.sleep(timeout or 0.0) if self.apart else self.process.ended.wait(timeout)
+        if (code := self.poll()) is None:
             raise subprocess.TimeoutExpired(self.process.name, timeout or 0.0)
-        return self.process.code
+        return code
 
 
 class LaunchedProcess(launcher.Process):
     """Process of a launcher behind simulated pipes."""
 
+    lines = 0  # number of texts of its output that came
+
     @property
     def output(self) -> str:
-        return "".join(self.handle.process.out)
+        texts = self.handle.process.out
+        if not self.handle.apart:
+            self.lines = len(texts)
+        return "".join(texts[: self.lines])
 
     def news(self) -> list[str]:
         lines = self.output[self.shown :].splitlines(keepends=True)
@@ -59,17 +74,23 @@ class LaunchedProcess(launcher.Process):
         return [line.rstrip("\n") for line in whole]
 
     def write(self) -> None:
-        self.handle.process.give(bytes(self.unsent))
-        self.unsent.clear()
+        if not self.handle.apart:
+            self.handle.process.give(bytes(self.unsent))
+            self.unsent.clear()
 
     def close(self) -> None:
-        self.handle.process.give(b"", eof=True)
+        if self.handle.apart:
+            current().after(BEAT_S, self.close)
+        else:
+            self.handle.process.give(b"", eof=True)
 
     def forget(self) -> None:
         return
 
     def signal(self, number: int) -> None:
-        if number == signal.SIGKILL:
+        if self.handle.apart:
+            self.handle.ssh_killed |= number == signal.SIGKILL
+        elif number == signal.SIGKILL:
             self.handle.process.kill()
         else:
             current().signal(self.handle.process, number)

@@ -34,7 +34,8 @@ def emergency_stop(look: Look, seen: Seen) -> str:
     at = min(look.world.stops, default=inf)
     if look.now <= at + 0.3 + look.slack_s or seen.process.started > at or not seen.flying or not seen.prompt:
         return ""
-    apart = look.spoiled({"pause", "kill", "late", "hang"}, seen.name, "router", "conductor")
+    apart = look.world.network.cuts_lifeline(look.world.conductor, seen.process)
+    apart = apart or look.spoiled({"pause", "kill", "late", "hang"}, seen.name, "router", "conductor")
     return "" if apart else f"motors on {look.now - at:.2f} s after the emergency stop"
 
 

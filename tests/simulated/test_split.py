@@ -85,6 +85,24 @@ def test_stop_names_what_it_does_not_reach(command):
     assert flight.violations == []
 
 
+@pytest.mark.parametrize("lasts", [2.0, 6.0, 60.0])
+def test_robots_beyond_land_without_ssh(lasts):
+    parts, stop = Fault(0.505, "split", "router2 C ssh", lasts=lasts), Fault(1.5, "command", "A", "estop")
+    flight = split(parts, *[stop] * (lasts == 6.0), experiment=DRONE, settings=["duration_s=8"])
+    robot, (process,) = flight.robots["C"], flight.of("default-C")
+    if lasts > 3.0:
+        (landing,) = [phase for phase in robot.phases if phase.phase == "landing"]
+        assert landing.reason == "nothing from the starter for 3 s"
+        assert parts.at + 2.5 <= landing.t < parts.at + 3.0 + SOON_S
+        assert robot.off() <= process.ended < parts.at + 3.0 + 2.5
+    else:
+        assert robot.phases[-1].reason == "finished"
+    for answer in flight.answers:
+        assert answer.code == 1
+        assert "NOT known to have stopped: C (1 of 2 robots" in answer.output
+    assert (flight.code, flight.violations) == (1, [])
+
+
 # end of the split, start of the second process, its clock [s]; who keeps the name, and more faults
 OWNERS = {
     "second process": (5.5, 1.0, 0.0, ()),
