@@ -25,6 +25,7 @@ PLACES: Final = {  # first place of each in those
 }  # fmt: skip
 LEAN: Final = 3  # numbers of a true position alone
 SENT: Final = 10  # numbers of a transmission
+LEAN_SENT: Final = 3  # first of those, without the pose
 
 
 class LinkQueue:
@@ -160,7 +161,7 @@ class Ledger:
         """Ledger of `transmissions` of each member, and `samples`."""
         self.start = start
         self.rows = rows = len(members)
-        self.lean, self.wide = lean, SENT + max(len(each.words) for each in members)
+        self.lean, self.wide = lean, LEAN_SENT if lean else SENT + max(len(each.words) for each in members)
         self.count, self.sample = 0, 0
         self.ended = self.moves = False
         self.times = array("d", (0.0,)) * samples
@@ -173,14 +174,16 @@ class Ledger:
     def note_sent(self, member: Member, t: float) -> None:
         robot, sent = member.robot, self.sent
         k = self.count * self.wide
+        self.count += 1
         sent[k], sent[k + 1] = float(member.row), float(member.seq)
         sent[k + 2] = t
+        if self.lean:
+            return
         sent[k + 3], sent[k + 4], sent[k + 5] = robot.sent_position
         sent[k + 6], sent[k + 7], sent[k + 8] = robot.sent_velocity
         sent[k + 9] = robot.now.state.yaw
         for j in range(self.wide - SENT):
             sent[k + SENT + j] = member.words[j]
-        self.count += 1
 
     def note_state(self, member: Member) -> None:
         """Note the state of a robot in the present sample."""
