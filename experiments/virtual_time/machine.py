@@ -24,7 +24,7 @@ FLAGS: Final = (
 )
 OF_C: Final = (
     "sin cos tan asin acos atan atan2 exp expm1 log log1p tanh pow fmod floor ceil trunc rint sqrt fabs copysign "
-    "memset memcpy memmove snprintf strtod"
+    "memset memcpy memmove snprintf strtod _setjmp longjmp"
 )  # functions of the C library
 IN_MEMORY: Final = 1  # code of an output that libtcc knows
 KEPT: Final[list[Any]] = []  # what compiled functions stand in

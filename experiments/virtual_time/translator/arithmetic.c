@@ -1,7 +1,7 @@
 /* Python's arithmetic, in C: the same bits for the same numbers.
 
-   What Python would raise sets `fault`: the ticks are then flown in Python, which tells the error. Whole numbers beyond
-   2^61 set it too, since Python's have no end. `turns` counts those of all loops: one that never ends is left. */
+   What Python would raise fails: the ticks are then flown in Python, which tells the error. Whole numbers beyond 2^61
+   fail too, since Python's have no end. `turns` counts those of all loops: one that never ends fails. */
 
 typedef long long whole, name; /* names of robots are their numbers */
 typedef unsigned long long word; /* arithmetic modulo 2^64 */
@@ -17,55 +17,60 @@ double strtod(const char *, char **);
 #define copysign __builtin_copysign
 #endif
 
-static whole fault, turns;
+static word way[64]; /* back to the function that Python called, from any that it calls */
+int _setjmp(void *) __attribute__((returns_twice));
+void longjmp(void *, int) __attribute__((noreturn));
+static void fail(void) __attribute__((noreturn, cold));
+static void fail(void) { longjmp(way, 1); }
+
+static whole turns;
 static whole (*back)(whole, whole, double *); /* calls a rare function of an object in Python; 1: an error */
 static const union { whole bits; double number; } unknown = {0x7ff8000000000000}; /* NaN */
 static const double inf = 1e999, largest = 2305843009213693952.0; /* 2^61 */
 static const whole exact = 9007199254740992; /* 2^53, up to which floats have every whole number */
 
 /* whole numbers: a sum of two that fit is no more than 2^62 */
-static inline whole py_fits(whole i) { if (i > (whole)largest || i < -(whole)largest) fault = 1; return i; }
+static inline whole py_fits(whole i) { if (i > (whole)largest || i < -(whole)largest) fail(); return i; }
 static inline whole py_product(whole i, whole j) {
   if (fabs((double)i * (double)j) < largest) return i * j;
-  fault = 1;
-  return 0;
+  fail();
 }
 static inline whole py_rest_i(whole i, whole j) { /* i % j: as j in sign */
-  if (j == 0) { fault = 1; return 0; }
+  if (j == 0) fail();
   whole rest = i % j;
   return rest != 0 && (rest < 0) != (j < 0) ? rest + j : rest;
 }
 static inline whole py_floor_i(whole i, whole j) { /* i // j */
-  if (j == 0) { fault = 1; return 0; }
+  if (j == 0) fail();
   return i / j - (i % j != 0 && (i < 0) != (j < 0));
 }
-static inline whole py_left(whole i, whole j) { return j < 0 || j > 60 ? (fault = 1, 0) : py_product(i, (whole)1 << j); }
-static inline whole py_right(whole i, whole j) { return j < 0 ? (fault = 1, 0) : i >> (j > 62 ? 62 : j); }
+static inline whole py_left(whole i, whole j) { return j < 0 || j > 60 ? (fail(), 0) : py_product(i, (whole)1 << j); }
+static inline whole py_right(whole i, whole j) { return j < 0 ? (fail(), 0) : i >> (j > 62 ? 62 : j); }
 static inline whole py_abs_i(whole i) { return i < 0 ? -i : i; }
 static inline whole py_min_i(whole i, whole j) { return j < i ? j : i; }
 static inline whole py_max_i(whole i, whole j) { return j > i ? j : i; }
-static inline double py_exact(whole i) { if (i > exact || i < -exact) fault = 1; return (double)i; }
+static inline double py_exact(whole i) { if (i > exact || i < -exact) fail(); return (double)i; }
 static inline double py_of_word(word x) { return x >> 63 ? 2.0 * (whole)(x >> 1 | (x & 1)) : (double)(whole)x; }
-static inline whole py_int(double x) { if (fabs(x) < largest) return (whole)x; fault = 1; return 0; }
+static inline whole py_int(double x) { if (fabs(x) < largest) return (whole)x; fail(); }
 
 /* floats */
-static inline double py_over(double x, double y) { if (y == 0.0) fault = 1; return x / y; }
+static inline double py_over(double x, double y) { if (y == 0.0) fail(); return x / y; }
 static inline double py_rest(double x, double y) { /* x % y: as y in sign */
-  if (y == 0.0) fault = 1;
+  if (y == 0.0) fail();
   double rest = fmod(x, y);
   return rest != 0.0 ? ((rest < 0.0) != (y < 0.0) ? rest + y : rest) : copysign(0.0, y);
 }
 static inline double py_floor_over(double x, double y) { /* x // y */
-  if (y == 0.0) fault = 1;
+  if (y == 0.0) fail();
   double rest = fmod(x, y), found = (x - rest) / y;
   if (rest != 0.0 && (rest < 0.0) != (y < 0.0)) found -= 1.0;
   if (found == 0.0) return copysign(0.0, x / y);
   return floor(found) + (found - floor(found) > 0.5);
 }
 static inline double py_power(double x, double y) { /* x ** y; x * x is not always the same as pow(x, 2) */
-  if ((x < 0.0 && fabs(x) < inf && fabs(floor(y) - y) > 0.0) || (x == 0.0 && y < 0.0 && y > -inf)) fault = 1;
+  if ((x < 0.0 && fabs(x) < inf && fabs(floor(y) - y) > 0.0) || (x == 0.0 && y < 0.0 && y > -inf)) fail();
   double found = pow(x, y);
-  if (fabs(found) == inf && fabs(x) < inf && fabs(y) < inf) fault = 1;
+  if (fabs(found) == inf && fabs(x) < inf && fabs(y) < inf) fail();
   return found;
 }
 static inline double py_min(double x, double y) { return y < x ? y : x; }
@@ -112,15 +117,15 @@ static double room[1 << 15];
 static whole rooms;
 static inline void *py_room(whole bytes) {
   whole words = (bytes + 7) / 8;
-  if (words < 0 || rooms + words > (whole)(sizeof room / 8)) { fault = 1; return room; }
+  if (words < 0 || rooms + words > (whole)(sizeof room / 8)) fail();
   rooms += words;
   return room + rooms - words;
 }
 
 /* of `math`, where some numbers are an error */
-#define OF_MATH(name, error) static inline double py_##name(double x) { if (error) fault = 1; return name(x); }
+#define OF_MATH(name, error) static inline double py_##name(double x) { if (error) fail(); return name(x); }
 #define GROWS(name) static inline double py_##name(double x) { \
-  double found = name(x); if (found == inf && x < inf) fault = 1; return found; }
+  double found = name(x); if (found == inf && x < inf) fail(); return found; }
 OF_MATH(sqrt, x < 0.0) OF_MATH(log, x <= 0.0) OF_MATH(log1p, x <= -1.0) OF_MATH(sin, fabs(x) == inf) OF_MATH(cos, fabs(x) == inf)
 OF_MATH(tan, fabs(x) == inf) OF_MATH(asin, fabs(x) > 1.0) OF_MATH(acos, fabs(x) > 1.0) GROWS(exp) GROWS(expm1)
 OF_MATH(atan, 0) OF_MATH(tanh, 0) OF_MATH(fabs, 0)

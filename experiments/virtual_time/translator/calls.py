@@ -23,7 +23,6 @@ from experiments.virtual_time.translator.expressions import GIVEN, NAMED, Expres
 from experiments.virtual_time.translator.kinds import (
     BOOLEAN,
     DOUBLE,
-    LEAVE,
     NAME,
     NONE,
     VOID,
@@ -116,7 +115,7 @@ class Calls(Expressions):
             raise self.error(node, f"a table of {' or '.join(sorted(map(listed, kinds)))}")
         self.emit(f"{self._program.c(kind)} {found};", f"switch ({name.text}) {{")
         self.emit(*(f"case {row}: {found} = {self.one(value)}; break;" for row, value in rows.items()))
-        other = f"fault = 1; {LEAVE}" if default.type == NONE else f"{found} = {self.one(default)};"
+        other = "fail();" if default.type == NONE else f"{found} = {self.one(default)};"
         self.emit(f"default: {other}", "}")
         return Value(kind, found)
 
@@ -168,11 +167,9 @@ class Calls(Expressions):
             texts = [self.one(each) for each in (*given[:fixed], more) if has_value(each.type)]
         text = f"{name}({', '.join(texts)})"
         if result == VOID:
-            self.emit(f"{text};", f"if (fault) {LEAVE}")
+            self.emit(f"{text};")
             return constant(None)
-        found = self.saved(Value(result, text))
-        self.emit(f"if (fault) {LEAVE}")
-        return found
+        return self.saved(Value(result, text))
 
     def call_back(self, thing: Value, which: int, given: Sequence[Value], node: ast.AST) -> Value:
         """Call of a rare function of an object, in Python, with numbers: objects are there; it returns nothing."""
@@ -180,10 +177,8 @@ class Calls(Expressions):
         several = [self.parts(each, node) if isinstance(each.type, Several) else [each] for each in values]
         parts = [part for each in several for part in each]
         numbers, name = ", ".join(self.of_type(each, DOUBLE, node).text for each in parts), self.new()
-        self.emit(
-            f"double {name}[] = {{{numbers or '0.0'}}};",
-            f"if (back((whole){thing.text}, {which}, {name})) {{ fault = 1; {LEAVE} }}",
-        )
+        self.emit(f"double {name}[] = {{{numbers or '0.0'}}};")
+        self.emit(f"if (back((whole){thing.text}, {which}, {name})) fail();")
         return constant(None)
 
     def builtin(self, found: Any, node: ast.Call) -> Value:  # noqa: PLR0911, PLR0912 - one for each sort

@@ -15,7 +15,6 @@ from experiments.virtual_time.translator.kinds import (
     ALL_BITS,
     BOOLEAN,
     DOUBLE,
-    LEAVE,
     NAME,
     NONE,
     WHOLE,
@@ -279,7 +278,7 @@ class Expressions(ast.NodeVisitor):
         self.emit(f"whole {name} = {self.number(k, WHOLE, node).text};")
         if k.constant is ... or k.constant < 0:
             self.emit(f"if ({name} < 0) {name} += {count};")
-        self.emit(f"if ((unsigned long long){name} >= (unsigned long long){count}) {{ fault = 1; {LEAVE} }}")
+        self.emit(f"if ((unsigned long long){name} >= (unsigned long long){count}) fail();")
         return Value(item_of(items.type), f"{items.text}.at[{name}]")
 
     def visit_UnaryOp(self, node: ast.UnaryOp) -> Value:

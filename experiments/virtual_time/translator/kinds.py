@@ -12,7 +12,6 @@ from typing import Any, Final, NamedTuple
 
 from experiments.virtual_time.records import BOOL, FLOAT, INT, UNSIGNED, Floats, Items, Measured, Named, RecordLayout
 
-LEAVE: Final = "@leave"  # stands for the return of a function at an error
 # types: numbers, by C's names, and what has no value; that of an object is its layout, that of a list its `Items`
 DOUBLE, WHOLE, WORD, BOOLEAN, VOID, NONE, NAME = "double", "whole", "word", "_Bool", "void", "none", "name"
 STORED: Final = {FLOAT: DOUBLE, INT: WHOLE, BOOL: WHOLE, UNSIGNED: WORD}  # types in a record
@@ -30,7 +29,7 @@ ALL_BITS: Final = (1 << 64) - 1
 C_WORDS: Final = re.compile(
     "auto|break|case|char|const|continue|default|do|double|else|enum|extern|float|for|goto|if|inline|int|long|register|"
     "restrict|return|short|signed|sizeof|static|struct|switch|typedef|union|unsigned|void|volatile|while|"
-    "whole|word|fault|turns|back|unknown|inf|exact|largest|nothing|fly|stretch|_.*|.*_|py_.*"
+    "whole|word|fail|way|turns|back|unknown|inf|exact|largest|nothing|longjmp|fly.*|stretch.*|_.*|.*_|py_.*"
 )
 
 

@@ -27,7 +27,6 @@ from experiments.virtual_time.translator.expressions import calls
 from experiments.virtual_time.translator.kinds import (
     BOOLEAN,
     DOUBLE,
-    LEAVE,
     NONE,
     STORED,
     VOID,
@@ -159,7 +158,7 @@ class Program:
         given, call = walk.head(), f"stretch({', '.join(map(mangled, walk.arguments))})"
         fly = (
             f"whole fly({given}, whole python) {{\n  back = (whole (*)(whole, whole, double *))python;\n"
-            f"  fault = turns = 0;\n  whole last = {call};\n  return fault ? -1 : last;\n}}\n"
+            f"  turns = 0;\n  return _setjmp(way) ? -1 : {call};\n}}\n"
         )
         return "\n".join([ARITHMETIC.read_text(encoding="utf-8"), *self._texts, walk.text("stretch"), fly])
 
@@ -193,10 +192,7 @@ class Walk(Calls):
         own = {each: kind for each, kind in self._locals.items() if each not in self.arguments and has_value(kind)}
         lines = [f"{self._program.c(kind)} {mangled(each)};" for each, kind in own.items()]
         result = self._program.c(self._result or VOID)
-        if result != VOID:
-            lines.append(f"static const {result} nothing;")
-        lines += [line.replace(LEAVE, "return;" if result == VOID else "return nothing;") for line in self._lines]
-        return "\n  ".join([f"static {result} {name}({self.head()}) {{", *lines]) + "\n}"
+        return "\n  ".join([f"static {result} {name}({self.head()}) {{", *lines, *self._lines]) + "\n}"
 
     def block(self, body: Sequence[ast.stmt]) -> None:
         self._ended = False
@@ -213,10 +209,10 @@ class Walk(Calls):
             self.visit(node.value)
 
     def visit_Assert(self, node: ast.Assert) -> None:
-        self.emit(f"if (!{self.condition(node.test).text}) {{ fault = 1; {LEAVE} }}")
+        self.emit(f"if (!{self.condition(node.test).text}) fail();")
 
     def visit_Raise(self, node: ast.Raise) -> None:
-        self.end(f"fault = 1; {LEAVE}")
+        self.end("fail();")
 
     def visit_Break(self, node: ast.Break | ast.Continue) -> None:
         self.end(f"{ast.unparse(node)};")
@@ -314,7 +310,7 @@ class Walk(Calls):
         items = [Value(item_of(each.type), f"{each.text}.at[{k}]") for each in lists]
         most = f"{lists[0].text}.count"
         for other in lists[1:]:  # strict, whatever `zip` says
-            self.emit(f"if ({other.text}.count != {most}) {{ fault = 1; {LEAVE} }}")
+            self.emit(f"if ({other.text}.count != {most}) fail();")
         items = [Value(WHOLE, k), *items] if function == "enumerate" else items
         item = items[0]
         if together:
@@ -380,8 +376,7 @@ class Walk(Calls):
 
         self.items(node, use, lambda most: marks.append((len(self._lines), most)))
         (mark, most), made = marks[0], Made(kinds[0])
-        room = f"{self._program.c(made)} {name} = {{py_room(({most}) * sizeof(*{name}.at)), 0}};"
-        self._lines[mark:mark] = [room, f"if (fault) {LEAVE}"]
+        self._lines.insert(mark, f"{self._program.c(made)} {name} = {{py_room(({most}) * sizeof(*{name}.at)), 0}};")
         return Value(made, name)
 
     def visit_DictComp(self, node: ast.DictComp) -> Value:
@@ -433,16 +428,14 @@ class Walk(Calls):
         self._lines[mark:mark] = [f"{kind} {result} = {int(found is all)}, {some} = 0;"]
         if found in (min, max):
             default = [self.visit(each.value) for each in node.keywords if each.arg == "default"]
-            other = (
-                f"{result} = {self.of_type(default[0], kind, node).text};" if default else f"{{ fault = 1; {LEAVE} }}"
-            )
+            other = f"{result} = {self.of_type(default[0], kind, node).text};" if default else "fail();"
             self.emit(f"if (!{some}) {other}")
         return Value(kind, result)
 
     def loop(self, head: str, node: ast.For | ast.While, begin: Callable[[], None]) -> None:
         if node.orelse:
             raise self.error(node.orelse[0], "`else` of a loop")
-        self.emit(head, f"if (fault || ++turns > {TURNS}) {{ fault = 1; {LEAVE} }}")
+        self.emit(head, f"if (++turns > {TURNS}) fail();")
         before = set(self._set)
         begin()
         self.block(node.body)
