@@ -95,6 +95,7 @@ REFUSED: Final[dict[str, str]] = {}  # reason by law or crew why it cannot be co
 DRIVERS: Final[dict[RecordLayout, CompiledLoop]] = {}  # drivers of this process
 RECENT: Final[dict[bytes, Prepared]] = {}  # cases that this process has flown; a few
 MAX_RECENT: Final = 8  # number of those
+TOGETHER: Final = 4  # most drivers of a program
 
 
 class Flown(Protocol):
@@ -157,15 +158,32 @@ class CompiledLoop:
     """Compiled loop over ticks for a crew, or why there is none."""
 
     program: Program
+    name: str = "fly"  # its function in the program
     text: str = ""  # program in C
     often: bool = False  # compiled for speed
     run: Any = None
     refusal: str = ""
 
+    def translate(self, source: str, types: Sequence[Any]) -> None:
+        """Translate it, with others that are not yet compiled for speed: what they share is compiled once."""
+        loops = [each for each in DRIVERS.values() if each.text and each.program.names == self.program.names]
+        for other in dict.fromkeys(each.program for each in loops):
+            together = [each for each in loops if each.program is other]
+            if len(together) == TOGETHER or any(each.often for each in together) or not other.is_plain or other.changed():
+                continue
+            joint, self.name = other.copy(), f"fly{len(together)}"
+            text = joint.entry(source, vars(tick), types, self.name)
+            if joint.is_plain:
+                for each in (*together, self):
+                    each.program, each.text = joint, text
+                return
+        self.name = "fly"
+        self.text = self.program.entry(source, vars(tick), types)
+
     def compile(self, *, often: bool) -> None:
         """Compile it, unless that is done; raises NoCompilerError."""
         if self.run is None or often > self.often:
-            (address,) = machine.machine(self.text, ["fly"], often=often)
+            (address,) = machine.machine(self.text, [self.name], often=often)
             of_c = ctypes.PYFUNCTYPE(ctypes.c_int64, ctypes.c_void_p, *(TYPES[kind] for kind in (*GIVEN, WHOLE)))
             self.often, self.run = often, of_c(address)
 
@@ -476,7 +494,7 @@ def driver(crew: RecordLayout, groups: int, names: Sequence[str], *, often: bool
     try:
         if known is not before:
             parts = {name: "; ".join(text.format(f"crew.g{k}") for k in range(groups)) for name, text in PARTS.items()}
-            known.text = known.program.entry(DRIVER.format(**parts), vars(tick), (crew, *GIVEN))
+            known.translate(DRIVER.format(**parts), (crew, *GIVEN))
         if not known.refusal:
             known.compile(often=often)
     except Exception as error:  # noqa: BLE001 - of any plug-in and compiler: the run is flown without them

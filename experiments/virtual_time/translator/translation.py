@@ -15,6 +15,7 @@ import re
 import sys
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import copy
 from functools import cache, partial
 from itertools import count
 from pathlib import Path
@@ -148,19 +149,32 @@ class Program:
             raise OutsideError(f"{place(function)}: {function.__qualname__} calls itself")
         return found
 
-    def entry(self, source: str, space: dict[str, Any], types: Sequence[Any]) -> str:
-        """Text of a function `fly`, which Python calls, from the source of `stretch`, and of all that this calls.
+    @property
+    def is_plain(self) -> bool:
+        """Whether it is the same for any law: nothing is called back, and there are no measures."""
+        return not (self.called_back or self.measures)
 
-        It returns −1 after an error.
+    def copy(self) -> Program:
+        """The same program, for other entries."""
+        found = copy(self)
+        for name in ("called_back", "measures", "_found", "_names", "_functions", "_texts"):
+            setattr(found, name, copy(getattr(self, name)))
+        return found
+
+    def entry(self, source: str, space: dict[str, Any], types: Sequence[Any], name: str = "fly") -> str:
+        """Text of the program with another function, which Python calls, from the source of `stretch`.
+
+        The function has this `name`, and returns −1 after an error.
         """
         walk = Walk(self, next(each for each in ast.parse(source).body if isinstance(each, ast.FunctionDef)), space)
         assert walk.result_for(types) == WHOLE
-        given, call = walk.head(), f"stretch({', '.join(map(mangled, walk.arguments))})"
+        given, call = walk.head(), f"stretch_{name}({', '.join(map(mangled, walk.arguments))})"
         fly = (
-            f"whole fly({given}, whole python) {{\n  back = (whole (*)(whole, whole, double *))python;\n"
+            f"whole {name}({given}, whole python) {{\n  back = (whole (*)(whole, whole, double *))python;\n"
             f"  turns = 0;\n  return _setjmp(way) ? -1 : {call};\n}}\n"
         )
-        return "\n".join([ARITHMETIC.read_text(encoding="utf-8"), *self._texts, walk.text("stretch"), fly])
+        self._texts += [walk.text(f"stretch_{name}"), fly]
+        return "\n".join([ARITHMETIC.read_text(encoding="utf-8"), *self._texts])
 
 
 class Walk(Calls):
