@@ -95,7 +95,7 @@ REFUSED: Final[dict[str, str]] = {}  # reason by law or crew why it cannot be co
 DRIVERS: Final[dict[RecordLayout, CompiledLoop]] = {}  # drivers of this process
 RECENT: Final[dict[bytes, Prepared]] = {}  # cases that this process has flown; a few
 MAX_RECENT: Final = 8  # number of those
-TOGETHER: Final = 4  # most drivers of a program
+TOGETHER: Final = 4  # most functions of a program that Python calls
 
 
 class Flown(Protocol):
@@ -169,15 +169,16 @@ class CompiledLoop:
         loops = [each for each in DRIVERS.values() if each.text and each.program.names == self.program.names]
         for other in dict.fromkeys(each.program for each in loops):
             together = [each for each in loops if each.program is other]
-            if len(together) == TOGETHER or any(each.often for each in together) or not other.is_plain or other.changed():
+            full = len(other.entries) == TOGETHER or any(each.often for each in together)
+            if full or not other.is_plain or other.changed():
                 continue
-            joint, self.name = other.copy(), f"fly{len(together)}"
-            text = joint.entry(source, vars(tick), types, self.name)
+            joint = other.copy()
+            text = joint.entry(source, vars(tick), types)
             if joint.is_plain:
+                self.name = joint.entries[-1]
                 for each in (*together, self):
                     each.program, each.text = joint, text
                 return
-        self.name = "fly"
         self.text = self.program.entry(source, vars(tick), types)
 
     def compile(self, *, often: bool) -> None:

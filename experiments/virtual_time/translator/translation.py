@@ -83,6 +83,7 @@ class Program:
         self.names = names or {}
         self.called_back: dict[str, str] = {}  # rare functions that stay in Python, with the reasons
         self.measures: list[str] = []  # names of the measures of all laws
+        self.entries: list[str] = []  # names of the functions that Python calls: fly, fly1, ...
         self._numbers = count()
         self._found: dict[tuple[Any, int, str], tuple[Callable[[], Any], Any]] = {}  # see `look`; each with a way to it
         self._names: dict[Any, str] = {}  # names of types
@@ -157,17 +158,19 @@ class Program:
     def copy(self) -> Program:
         """The same program, for other entries."""
         found = copy(self)
-        for name in ("called_back", "measures", "_found", "_names", "_functions", "_texts"):
+        for name in ("entries", "called_back", "measures", "_found", "_names", "_functions", "_texts"):
             setattr(found, name, copy(getattr(self, name)))
         return found
 
-    def entry(self, source: str, space: dict[str, Any], types: Sequence[Any], name: str = "fly") -> str:
+    def entry(self, source: str, space: dict[str, Any], types: Sequence[Any]) -> str:
         """Text of the program with another function, which Python calls, from the source of `stretch`.
 
-        The function has this `name`, and returns −1 after an error.
+        The function has the last name of `entries`, and returns −1 after an error.
         """
         walk = Walk(self, next(each for each in ast.parse(source).body if isinstance(each, ast.FunctionDef)), space)
         assert walk.result_for(types) == WHOLE
+        name = f"fly{len(self.entries) or ''}"
+        self.entries.append(name)
         given, call = walk.head(), f"stretch_{name}({', '.join(map(mangled, walk.arguments))})"
         fly = (
             f"whole {name}({given}, whole python) {{\n  back = (whole (*)(whole, whole, double *))python;\n"
