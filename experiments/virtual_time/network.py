@@ -244,9 +244,9 @@ class VirtualNetwork:
         for _, _, link, arrival, sample in sorted(under_way, key=itemgetter(0, 1, 2)):  # same order as they were sent
             self._channel.put(link, arrival, sample)
         sent = np.frombuffer(ledger.sent)[: ledger.count * ledger.wide].reshape(-1, ledger.wide)
-        row, stamp = sent[:, 0], sent[:, 2]
-        if np.any((row[1:] < row[:-1]) & (stamp[1:] <= stamp[:-1])):  # robots of a kind are flown together
-            sent = sent[np.lexsort((row, stamp))]
+        rows, times = sent[:, 0], sent[:, 2]
+        if np.any((rows[1:] < rows[:-1]) & (times[1:] <= times[:-1])):  # robots of a kind are flown together
+            sent = sent[np.lexsort((rows, times))]
         sent, words = sent[:, :SENT], sent[:, SENT:]
         self._sent.extend(sent, sent[:, 2], sent[:, 0].astype(np.intp))
         if self.says and not self._lean:
