@@ -6,6 +6,7 @@ A command prints them without a traceback and ends with exit code 2.
 import difflib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 
 
 class ExplainedError(Exception):
@@ -23,6 +24,18 @@ def writing(place: object, remedy: str) -> Iterator[None]:
         yield
     except OSError as error:
         raise ExplainedError(f"{place}: cannot be written: {error.strerror}; {remedy}") from None
+
+
+@contextmanager
+def replacing(file: Path) -> Iterator[Path]:
+    """A place to write to, which takes the name of `file` after the block; what was there stays if that fails."""
+    file = file.resolve()  # a link stays one
+    draft = file.with_name(f"{file.name}.new")
+    try:
+        yield draft
+        draft.replace(file)
+    finally:
+        draft.unlink(missing_ok=True)
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

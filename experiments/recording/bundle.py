@@ -16,6 +16,7 @@ from typing import Final
 
 import msgspec
 
+from agents.errors import replacing
 from experiments.definition.plan import Plan
 from experiments.file.choices import plugin_files
 from experiments.recording.reader import RecordingError, Records
@@ -79,16 +80,12 @@ def write(folder: Path, target: Path, plans: list[Plan]) -> Path:
     members: dict[str, Path | bytes] = dict(_files(folder, target))
     members |= {f"plugins/{file.name}": file for file in sorted(_plugins(plans))}
     members |= {"README.txt": text.encode(), "requirements.txt": "".join(requirements).encode()}
-    draft = target.with_name(f"{target.name}.new")
     try:
-        with zipfile.ZipFile(draft, "w", zipfile.ZIP_DEFLATED) as archive:
+        with replacing(target) as draft, zipfile.ZipFile(draft, "w", zipfile.ZIP_DEFLATED) as archive:
             sums = [f"{_add(archive, name, members[name])}  {name}\n" for name in sorted(members)]
             _add(archive, SUMS, "".join(sums).encode())
-        draft.replace(target)
     except OSError as error:
         raise RecordingError(f"{error.filename or target}: {error.strerror}: no bundle was made") from None
-    finally:
-        draft.unlink(missing_ok=True)
     return target
 
 

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Final
 
 import msgspec
 
+from agents.errors import replacing
 from experiments.file.arena_file import KEPT
 from experiments.file.document import Document
 from experiments.file.problems import refusal
@@ -58,13 +59,8 @@ def read_origin(folder: Path) -> RunOrigin | None:
 
 def keep_origin(folder: Path, origin: RunOrigin) -> None:
     """Write the origin of a run into its folder; the former stays if there is no room."""
-    fresh = folder / f"{ORIGIN}.new"
-    try:
+    with replacing(folder / ORIGIN) as fresh:
         fresh.write_bytes(msgspec.json.format(msgspec.json.encode(origin), indent=2) + b"\n")
-        fresh.replace(folder / ORIGIN)
-    except OSError:
-        fresh.unlink(missing_ok=True)
-        raise
 
 
 @contextmanager

@@ -10,6 +10,7 @@ from typing import Any, Final, NamedTuple
 import msgspec
 import numpy as np
 
+from agents.errors import replacing
 from experiments.metrics import criteria
 from experiments.metrics.results import CaseMetrics, RobotMetrics, ShadowMetrics
 from experiments.metrics.statistics import ratios
@@ -54,7 +55,7 @@ def _of_robot(robot: RobotMetrics, case: CaseMetrics) -> dict[str, float | None]
 
 def write_csv(path: Path, cases: Sequence[CaseMetrics]) -> None:
     """Rows per case and robot, and a row `mean` per case; empty where a value is unknown."""
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with replacing(path) as fresh, fresh.open("w", newline="", encoding="utf-8") as file:
         table = csv.DictWriter(file, _columns(cases), restval="")
         table.writeheader()
         for case in cases:
@@ -109,7 +110,8 @@ def _flat_shadow(shadow: ShadowMetrics | None) -> dict[str, object]:
 def write_json(path: Path, cases: Sequence[CaseMetrics]) -> None:
     """All metrics, one object per case."""
     text = msgspec.json.encode(criteria.with_judgements(cases))
-    path.write_bytes(msgspec.json.format(text, indent=2) + b"\n")
+    with replacing(path) as fresh:
+        fresh.write_bytes(msgspec.json.format(text, indent=2) + b"\n")
 
 
 def read_json(path: Path) -> list[CaseMetrics]:
@@ -133,7 +135,7 @@ _BAND: Final = ("case", "seeds", "time_s", "median_m", "lowest_m", "highest_m")
 
 def write_bands(path: Path, bands: Mapping[str, Band]) -> None:
     """The errors over seeds of each case as a table: recordings of most seeds are not kept."""
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with replacing(path) as fresh, fresh.open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         table.writerow(_BAND)
         for case, band in bands.items():

@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
+from agents.errors import replacing
 from experiments.metrics.statistics import Spread
 from experiments.recording import version
 
@@ -166,7 +167,8 @@ def render(
         foot=version.provenance().words[:2] if foot is None else foot,
         replay=replay,
     )
-    target.write_text(page, encoding="utf-8")
+    with replacing(target) as fresh:
+        fresh.write_text(page, encoding="utf-8")
     return target
 
 

@@ -16,6 +16,7 @@ from typing import Final, Self
 
 import msgspec
 
+from agents.errors import replacing
 from experiments.file.problems import DocumentError, refusal
 from experiments.sweep.runs import RunMetrics, WorkResult
 
@@ -76,7 +77,8 @@ class Store:
         except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):
             before = now
         try:
-            path.write_bytes(msgspec.json.format(msgspec.json.encode(now), indent=2) + b"\n")
+            with replacing(path) as fresh:
+                fresh.write_bytes(msgspec.json.format(msgspec.json.encode(now), indent=2) + b"\n")
         except OSError as error:
             raise self._full(error) from None
         found = []

@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import msgspec
 
+from agents.errors import replacing
 from experiments.file import reference as reference_of_file
 from experiments.metrics.comparable import equally_long
 from experiments.metrics.metric import Metric, facts_of, from_facts, short_name, swept_metrics
@@ -123,7 +124,7 @@ def write_csv(path: Path, rows: Sequence[CellRow], metrics: Mapping[str, Metric]
     columns = [part for name in metrics for part in (name, f"{name}_ci95")]
     columns += [part for name in relative_metrics(metrics) for part in (f"{name}_ratio", f"{name}_ratio_ci95")]
     head = ["case", *paths, "reference", "seeds", "failed", "missing", *columns, "acquired_share", "gap_min_s"]
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with replacing(path) as fresh, fresh.open("w", newline="", encoding="utf-8") as file:
         table = csv.DictWriter(file, head, restval="")
         table.writeheader()
         for each in rows:
@@ -148,7 +149,8 @@ def document(
 
 def write_json(path: Path, table: Mapping[str, Any]) -> None:
     """Writes a table of `document`."""
-    path.write_bytes(msgspec.json.format(msgspec.json.encode(table), indent=2) + b"\n")
+    with replacing(path) as fresh:
+        fresh.write_bytes(msgspec.json.format(msgspec.json.encode(table), indent=2) + b"\n")
 
 
 def read_json(path: Path) -> tuple[dict[str, Any], list[CellRow], dict[str, Metric]]:

@@ -15,7 +15,7 @@ import cv2
 import msgspec
 import numpy as np
 
-from agents.errors import ExplainedError
+from agents.errors import ExplainedError, replacing
 from bridges.motion_capture.cameras import file
 from bridges.motion_capture.cameras.file import CamerasFile, FloorTags, MeasuredCamera
 from bridges.motion_capture.cameras.images import Images
@@ -220,7 +220,8 @@ def calibrate_file(path: Path, *, again: bool, limit_s: float) -> None:
         images.close()
     text = file.with_measured(path.read_text("utf-8"), measured)
     file.parse(text, str(path))
-    path.write_text(text, "utf-8")
+    with replacing(path) as fresh:
+        fresh.write_text(text, "utf-8")
 
 
 def print_sheets(path: Path, page: Path) -> None:
