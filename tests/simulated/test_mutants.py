@@ -44,6 +44,9 @@ MUTANTS = {
         DESCENT, "self._resigned = True", "pass",
         test_safety.test_robot_without_an_answer_about_its_owner_lands,
     ),
+    "time of asking is no matter": (
+        DESCENT, "robot.hazards.since[Cause.OWNER] = robot.health.asked_since", "pass", run("asks_for_its_owner"),
+    ),
     "displaced body landed by the watchdog": (
         WATCHDOG, "displaced = self._displaced()", "displaced = False", former_owner("in a loop that hangs"),
     ),
