@@ -76,9 +76,9 @@ class _ExternalRobot:
         return ZERO if stands else self.pose.velocity
 
     def adopt_flight(self) -> None:
-        """Count a robot in the air as flying: a former process, which has died there, had ordered its take-off."""
+        """Count a robot in the air, or on its way down, as flying: of a former process, which has died there."""
         x, y, z = self.pose.position
-        if self.flies and not self.flight.flying and z > FLOOR_M:
+        if self.flies and not self.flight.flying and (z > FLOOR_M or self.pose.velocity[2] < -SETTLED):
             self.flight.take_off((x, y, 0.0))
 
     def goes_on(self, now: float) -> bool:

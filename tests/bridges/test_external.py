@@ -193,6 +193,20 @@ def test_restarted_simulator_hears_orders_under_way(far):
     assert far.counts() == about({("CF01", "drive"): 50, ("TE01", "land"): 50})  # what is steered need not climb
 
 
+@pytest.mark.parametrize("order", ["land", "stop"])
+def test_descent_of_a_killed_process_is_adopted(far, order):
+    """A robot lower than a table that still comes down for a process that is gone is not down yet (seed 1027577)."""
+    body = far.body("CF01")
+    for z in np.arange(0.45, 0.3, -0.006):
+        far.place = {"CF01": (0.0, 0.0, float(z))}
+        state = far.run(body, 0.02)
+    assert not state.flying.any()
+    getattr(body, order)([0])
+    assert far.run(body, 0.1).flying.all()
+    far.place = {"CF01": HERE}
+    assert not far.run(body, 1.5).flying.any()
+
+
 def test_stop_is_repeated_as_the_last_word(far):
     body, rows = far.body(*ROWS), range(3)
     far.place = dict.fromkeys(ROWS, HERE)
