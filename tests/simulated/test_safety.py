@@ -16,6 +16,7 @@ FLIER, WHEELS = "crazyflie", "khepera4"
 WORLD = DRONE.replace("hover = 0.8", 'hover = 0.8, body = "world"')
 LOST = "its own position is lost"
 SILENT = "no connection to a router"
+ASKED = "it asked who owns its name"
 SOON_S = 2.5 * TICK_S  # the robot reads its body, decides and tells
 HEARD_S = 0.1  # delay of an event, with the look of the conductor every 0.05 s
 
@@ -65,9 +66,12 @@ LONG_ROWS = {
         (1.3, 1.8, f"hold: {SILENT}"), (10.3, 10.8, f"land: {SILENT}"),
     ]),
     "cut_shortly": (FLIER, Fault(AT_S, "cut", lasts=2.5), [
-        (1.3, 1.8, f"hold: {SILENT}"), (2.5, 4.6, f"over: {SILENT}"),
+        (1.3, 1.8, f"hold: {SILENT}"), (2.5, 3.0, f"hold: {ASKED}"), (2.5, 4.6, f"over: {SILENT}"),
+        (2.5, 4.6, f"over: {ASKED}"),
     ]),
-    "hardly_cut": (FLIER, Fault(AT_S, "cut", lasts=0.9), []),
+    "hardly_cut": (FLIER, Fault(AT_S, "cut", lasts=0.9), [
+        (0.9, 1.4, f"hold: {ASKED}"), (1.9, 2.6, f"over: {ASKED}"),
+    ]),
 }  # fmt: skip
 
 
